@@ -1,0 +1,1 @@
+"""Photographs, calibration and silhouettes: everything that is read before a fit."""
