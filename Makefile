@@ -1,0 +1,70 @@
+# make setup | fit | test | check | format | bench
+# PYTHON chooses the interpreter; its own torch >= 2.10 is used if it has one, else TORCH is installed.
+PYTHON ?= python3
+TORCH ?= torch==2.13.0
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.ready
+LIBRARY := torch_surfcap/_C.abi3.so
+CSRC := $(wildcard csrc/*.* csrc/*/*.*)
+CXX_FILES := $(filter %.c %.cpp %.h %.cu %.cuh,$(CSRC))
+
+define HAS_TORCH
+import importlib.metadata, sys
+try:
+    version = importlib.metadata.version("torch").split(".")
+except importlib.metadata.PackageNotFoundError:
+    version = ["0", "0"]
+sys.exit(0 if (int(version[0]), int(version[1])) >= (2, 10) else 1)
+endef
+export HAS_TORCH
+
+# A virtual environment made from another one does not see its packages: a .pth file shows them.
+define SHOW_PARENT
+import pathlib, sys, sysconfig
+if sys.prefix != sys.base_prefix:
+    site = sysconfig.get_path("purelib", vars={"base": sys.argv[1], "platbase": sys.argv[1]})
+    (pathlib.Path(site) / "_parent.pth").write_text(sysconfig.get_path("purelib") + "\n")
+endef
+export SHOW_PARENT
+
+.PHONY: setup fit test check format bench
+.DELETE_ON_ERROR:
+
+setup: $(STAMP) $(LIBRARY)
+
+$(STAMP): pyproject.toml
+	@if test -x $(BIN)/python; then :; \
+	elif $(PYTHON) -c "$$HAS_TORCH"; then \
+	  $(PYTHON) -m venv --system-site-packages $(VENV) && $(PYTHON) -c "$$SHOW_PARENT" $(VENV); \
+	else $(PYTHON) -m venv $(VENV); fi
+	@$(BIN)/python -c "$$HAS_TORCH" || $(BIN)/python -m pip install "$(TORCH)"
+	$(BIN)/python -m pip install -q "setuptools>=77" wheel
+	$(BIN)/python -m pip install -q --no-build-isolation -e ".[dev]"
+	$(BIN)/python -m pip install -q --ignore-installed --no-deps ruff clang-format  # their programs, in BIN
+	@touch $@
+
+$(LIBRARY): setup.py $(CSRC) | $(STAMP)
+	@$(BIN)/python setup.py -q build_ext --inplace
+	@touch $@
+
+fit: setup
+	$(BIN)/python train/fit.py --config configs/sample.yaml
+	$(BIN)/python train/evaluate.py --run out/sample
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m mypy
+	$(if $(CXX_FILES),$(BIN)/clang-format --dry-run -Werror $(CXX_FILES))
+
+format: setup
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+	$(if $(CXX_FILES),$(BIN)/clang-format -i $(CXX_FILES))
+
+bench: setup
+	$(BIN)/python train/bench.py --out docs/benchmarks.md
