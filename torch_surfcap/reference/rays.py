@@ -1,0 +1,219 @@
+"""The ray march, the fused photometric step and the visibility of voxels, on a dense [R, K] lattice.
+
+Equation numbers are of Toussaint, Genisson, Franco, "Fast Gradient Descent for Surface Capture Via
+Differentiable Rendering", 3DV 2022.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .store import TILE, corners, dense, dense_index, nonempty_cells
+from .voxels import huber
+
+TRANSPARENCY, DISTANCE = 0, 1  # what the first coefficient of a voxel means
+BASIS_OF_PITCH = {4: 1, 16: 4, 32: 9}  # padded record length -> spherical harmonics per channel
+
+
+def harmonics(directions: Tensor, count: int) -> Tensor:
+    """Real spherical harmonics without their constants, [..., 3] unit directions -> [..., count], count 1, 4
+    or 9.
+    """
+    x, y, z = directions.unbind(-1)
+    functions = [
+        torch.ones_like(x),
+        y,
+        z,
+        x,
+        x * y,
+        y * z,
+        0.5 * (3 * z * z - 1),
+        x * z,
+        0.5 * (x * x - y * y),
+    ]
+    return torch.stack(functions[:count], -1)
+
+
+class March(NamedTuple):
+    """Samples of R rays on a lattice of K distances; after a ray's end and in empty cells a = 1."""
+
+    t: Tensor  # [R,K] distance from the origin
+    a: Tensor  # [R,K] transparency
+    color: Tensor  # [R,K,3]
+    transmittance: Tensor  # [R,K+1] exclusive: what is left before sample k, and at the end
+    visited: Tensor  # [R,K] bool: in a non-empty cell and before the ray's end
+    corners: Tensor  # [R,K,8,3] dense grid index of the voxels read
+    corner_weights: Tensor  # [R,K,8]
+
+    @property
+    def weight(self) -> Tensor:
+        return (1 - self.a) * self.transmittance[:, :-1]
+
+
+def march(
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    opacity: int,
+    kappa: float,
+    step: float,
+    stop: float,
+) -> March:
+    """All samples of all rays; see `march_forward` for the arguments."""
+    low = origins.new_tensor(frame[:3])
+    extent = frame[3] * TILE * origins.new_tensor(table.shape)
+    farthest = torch.maximum((origins - low).abs(), (origins - low - extent).abs()).norm(dim=-1)
+    count = math.ceil(float(farthest.max()) / step) + 2 if len(origins) else 0
+    t = (torch.arange(count, device=origins.device) + 0.5 + shift[:, None]) * step
+    index, corner, base = corners(origins[:, None] + t[..., None] * directions[:, None], table, frame)
+
+    tile = base.div(TILE, rounding_mode="floor")
+    within = ((tile >= 0) & (tile < torch.tensor(table.shape, device=tile.device))).all(-1)
+    active = (
+        within & nonempty_cells(table)[tile.clamp(min=0).minimum(base.new_tensor(table.shape) - 1).unbind(-1)]
+    )
+
+    record = (dense(voxels, table, frame)[index.unbind(-1)] * corner[..., None]).sum(-2)
+    basis = BASIS_OF_PITCH[voxels.shape[-1]]
+    coefficients = record[..., 1 : 1 + 3 * basis].unflatten(-1, (basis, 3))
+    color = torch.einsum("rl,rklc->rkc", harmonics(directions, basis), coefficients)
+    value = record[..., 0]
+    if opacity == TRANSPARENCY:
+        a = value
+    else:
+        # a_k = min(1, (1 + E_{k-1}) / (1 + E_k)), log(1 + E) = softplus(-kappa s); before a run's first
+        # sample E = 0.
+        follows = torch.nn.functional.pad(active[:, :-1], (1, 0))
+        log_e = torch.nn.functional.softplus(-kappa * value)
+        log_before = torch.where(follows, torch.nn.functional.pad(log_e[:, :-1], (1, 0)), 0)
+        a = (log_before - log_e).clamp(max=0).exp()
+        color_before = torch.nn.functional.pad(color[:, :-1], (0, 0, 1, 0))
+        color = torch.where(follows[..., None], 0.5 * (color_before + color), color)
+
+    a = torch.where(active, a, 1)
+    left = torch.cumprod(a.detach(), 1) >= stop  # after sample k
+    alive = torch.cumprod(torch.nn.functional.pad(left[:, :-1], (1, 0), value=True), 1).bool()
+    a = torch.where(alive, a, 1)
+    transmittance = torch.cat([a.new_ones(len(a), 1), torch.cumprod(a, 1)], 1)
+    return March(t, a, color, transmittance, active & alive, index, corner)
+
+
+def march_forward(
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    background: Tensor,
+    opacity: int,
+    kappa: float,
+    step: float,
+    stop: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour [R,3], transmittance [R] and depth [R] of rays; depth is NaN where no sample has weight.
+
+    origins [R,3] world, directions [R,3] unit, shift [R] in steps, background [R,3]; opacity 0 =
+    transparency, 1 = signed distance with slope kappa; step in world units; a ray ends once its transmittance
+    is below stop.
+    """
+    m = march(voxels, table, frame, origins, directions, shift, opacity, kappa, step, stop)
+    left = m.transmittance[:, -1]
+    total = m.weight.sum(1)
+    depth = torch.where(total != 0, (m.weight * m.t).sum(1) / torch.where(total != 0, total, 1), math.nan)
+    return (m.weight[..., None] * m.color).sum(1) + left[:, None] * background, left, depth
+
+
+def march_backward(
+    grad_color: Tensor,
+    grad_transmittance: Tensor,
+    grad_depth: Tensor,
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    background: Tensor,
+    opacity: int,
+    kappa: float,
+    step: float,
+    stop: float,
+    groups: int = 1,
+) -> Tensor:
+    """Gradient by the voxels [T,4,4,4,P]; rays without a depth pass nothing on from grad_depth."""
+    leaf = voxels.detach().requires_grad_()
+    color, transmittance, depth = march_forward(
+        leaf, table, frame, origins, directions, shift, background, opacity, kappa, step, stop
+    )
+    solid = ~depth.isnan()
+    outputs, grads = (color, transmittance, depth[solid]), (grad_color, grad_transmittance, grad_depth[solid])
+    return torch.autograd.grad(outputs, leaf, grads)[0]
+
+
+def photometric_step(
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    background: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    weight: Tensor,
+    opacity: int,
+    kappa: float,
+    step: float,
+    stop: float,
+    huber_eps: float,
+    weights: Sequence[float],
+    detach_sample: bool,
+    groups: int = 1,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Losses [3] (photo, sample: eq. 10, mask), gradient of weights · losses, colour [R,3], transmittance
+    [R].
+
+    target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss.
+    """
+    leaf = voxels.detach().requires_grad_()
+    m = march(leaf, table, frame, origins, directions, shift, opacity, kappa, step, stop)
+    left = m.transmittance[:, -1]
+    color = (m.weight[..., None] * m.color).sum(1) + left[:, None] * background
+    w = m.weight.detach() if detach_sample else m.weight
+    photo = huber(color - target, huber_eps).sum(-1)
+    sample = (w * huber(m.color - target[:, None], huber_eps).sum(-1)).sum(1)
+    losses = torch.stack([(weight * term).sum() for term in (photo, sample, (left - (1 - mask)) ** 2)])
+    (gradient,) = torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)
+    return losses.detach().double(), gradient, color.detach(), left.detach()
+
+
+def visibility(
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    opacity: int,
+    kappa: float,
+    step: float,
+    stop: float,
+) -> Tensor:
+    """[T,4,4,4,2]: per voxel the largest T_k and the largest w_k of the samples that read it."""
+    m = march(voxels, table, frame, origins, directions, shift, opacity, kappa, step, stop)
+    row = dense_index(table)[m.corners.unbind(-1)]  # [R,K,8]
+    reads = (row >= 0) & (m.corner_weights > 0) & m.visited[..., None]
+    seen = voxels.new_zeros(voxels.shape[0] * TILE**3, 2)
+    for channel, quantity in enumerate((m.transmittance[:, :-1], m.weight)):
+        values = quantity[..., None].expand_as(row)[reads].detach()
+        seen[:, channel].scatter_reduce_(0, row[reads], values, "amax")
+    return seen.view(-1, TILE, TILE, TILE, 2)

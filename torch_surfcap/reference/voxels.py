@@ -1,0 +1,101 @@
+"""The voxel terms of the loss, Adam, and the soft hull."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .store import dense, dense_index
+
+
+def huber(x: Tensor, eps: float) -> Tensor:
+    """x²/2 for |x| < eps, eps (|x| - eps/2) above."""
+    return torch.where(x.abs() < eps, 0.5 * x * x, eps * (x.abs() - 0.5 * eps))
+
+
+def voxel_terms(
+    voxels: Tensor,
+    table: Tensor,
+    coords: Tensor,
+    frame: Sequence[float],
+    weights: Sequence[float],
+    parsimony_huber: float,
+    grad: Tensor,
+) -> Tensor:
+    """Losses [5] in double, unweighted: TV of the opacity value, TV of colour, parsimony (eq. 11), ballooning
+    (eq. 12) and a fifth that is zero; adds the gradient of weights · losses to `grad` [T,4,4,4,P].
+
+    TV sums (x_i - x_j)² over unordered pairs of 6-neighbours of which at least one is stored. A missing
+    neighbour has its boundary value for the opacity value and does not count for colour. coords [T,3] place
+    the tiles in the table.
+    """
+    if not bool((table[coords.long().unbind(-1)] == torch.arange(len(coords), device=table.device)).all()):
+        raise ValueError("coords: expected the place of every tile in the table")
+    leaf = voxels.detach().requires_grad_()
+    grid, stored = dense(leaf, table, frame), dense_index(table) >= 0
+    tv_opacity, tv_color = leaf.new_zeros(()), leaf.new_zeros(())
+    for axis in range(3):
+        last = grid.shape[axis] - 1
+        squares = (grid.narrow(axis, 0, last) - grid.narrow(axis, 1, last)) ** 2
+        first, second = stored.narrow(axis, 0, last), stored.narrow(axis, 1, last)
+        tv_opacity = tv_opacity + squares[..., 0][first | second].sum()
+        tv_color = tv_color + squares[..., 1:][first & second].sum()
+    parsimony = huber(leaf[..., 4:], parsimony_huber).sum()
+    ballooning = (leaf[..., 0] ** 2).sum()
+    losses = torch.stack([tv_opacity, tv_color, parsimony, ballooning, leaf.new_zeros(())])
+    grad += torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)[0]
+    return losses.detach().double()
+
+
+def adam_step(
+    voxels: Tensor,
+    grad: Tensor,
+    m: Tensor,
+    v: Tensor,
+    rate: Tensor,
+    low: Tensor,
+    high: Tensor,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    t: int,
+) -> None:
+    """One bias-corrected step of Adam (Kingma and Ba 2015), the t-th from 1, in place; then the clamp to
+    [low, high].
+
+    rate, low, high [P] are per coefficient.
+    """
+    m.mul_(beta1).add_(grad, alpha=1 - beta1)
+    v.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+    step = (m / (1 - beta1**t)) / ((v / (1 - beta2**t)).sqrt() + eps)
+    voxels.copy_(torch.minimum(torch.maximum(voxels - rate * step, low), high))
+
+
+def soft_hull(points: Tensor, projections: Tensor, masks: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+    """Least mask [N] over the cameras that see each point [N,3] (0 where none does), and their number [N]
+    int32.
+
+    projections [V,3,4] to pixels with pixel (0,0) centred at (0.5, 0.5); masks: all [H,W] end to end; sizes
+    [V,2] = width, height. A camera sees what lies in front of it inside its picture, the edge included.
+    """
+    value = points.new_full((len(points),), torch.inf)
+    votes = torch.zeros(len(points), dtype=torch.int32, device=points.device)
+    start = 0
+    for projection, (width, height) in zip(projections, sizes.tolist(), strict=True):
+        mask = masks[start : start + width * height].view(height, width)
+        start += width * height
+        h = points @ projection[:, :3].T + projection[:, 3]
+        u, v = h[:, 0] / h[:, 2], h[:, 1] / h[:, 2]
+        seen = (h[:, 2] > 0) & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+        x = torch.where(seen, u - 0.5, 0).clamp(0, width - 1)
+        y = torch.where(seen, v - 0.5, 0).clamp(0, height - 1)
+        x0, y0 = x.floor().long(), y.floor().long()
+        x1, y1 = (x0 + 1).clamp(max=width - 1), (y0 + 1).clamp(max=height - 1)
+        fx, fy = x - x0, y - y0
+        read = (1 - fy) * ((1 - fx) * mask[y0, x0] + fx * mask[y0, x1])
+        read = read + fy * ((1 - fx) * mask[y1, x0] + fx * mask[y1, x1])
+        value = torch.where(seen, torch.minimum(value, read), value)
+        votes += seen
+    return torch.where(votes > 0, value, 0), votes
