@@ -21,7 +21,7 @@ from .rays import (
     visibility,
 )
 from .store import INSIDE, OUTSIDE, TILE, dense, nonempty_cells, sample_backward, sample_forward, upscale
-from .voxels import adam_step, huber, soft_hull, voxel_terms
+from .voxels import adam_step, huber_norm, soft_hull, voxel_terms
 
 __all__ = [
     "BASIS_OF_PITCH",
@@ -33,7 +33,7 @@ __all__ = [
     "adam_step",
     "dense",
     "harmonics",
-    "huber",
+    "huber_norm",
     "march",
     "march_backward",
     "march_forward",

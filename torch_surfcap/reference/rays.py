@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .store import TILE, corners, dense, dense_index, nonempty_cells
-from .voxels import huber
+from .voxels import huber_norm
 
 TRANSPARENCY, DISTANCE = 0, 1  # what the first coefficient of a voxel means
 BASIS_OF_PITCH = {4: 1, 16: 4, 32: 9}  # padded record length -> spherical harmonics per channel
@@ -63,7 +63,7 @@ def march(
     directions: Tensor,
     shift: Tensor,
     opacity: int,
-    kappa: float,
+    slope: float,
     step: float,
     stop: float,
 ) -> March:
@@ -89,10 +89,10 @@ def march(
     if opacity == TRANSPARENCY:
         a = value
     else:
-        # a_k = min(1, (1 + E_{k-1}) / (1 + E_k)), log(1 + E) = softplus(-kappa s); before a run's first
+        # a_k = min(1, (1 + E_{k-1}) / (1 + E_k)), log(1 + E) = softplus(-slope s); before a run's first
         # sample E = 0.
         follows = torch.nn.functional.pad(active[:, :-1], (1, 0))
-        log_e = torch.nn.functional.softplus(-kappa * value)
+        log_e = torch.nn.functional.softplus(-slope * value)
         log_before = torch.where(follows, torch.nn.functional.pad(log_e[:, :-1], (1, 0)), 0)
         a = (log_before - log_e).clamp(max=0).exp()
         color_before = torch.nn.functional.pad(color[:, :-1], (0, 0, 1, 0))
@@ -115,17 +115,17 @@ def march_forward(
     shift: Tensor,
     background: Tensor,
     opacity: int,
-    kappa: float,
+    slope: float,
     step: float,
     stop: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colour [R,3], transmittance [R] and depth [R] of rays; depth is NaN where no sample has weight.
 
     origins [R,3] world, directions [R,3] unit, shift [R] in steps, background [R,3]; opacity 0 =
-    transparency, 1 = signed distance with slope kappa; step in world units; a ray ends once its transmittance
+    transparency, 1 = signed distance with slope slope; step in world units; a ray ends once its transmittance
     is below stop.
     """
-    m = march(voxels, table, frame, origins, directions, shift, opacity, kappa, step, stop)
+    m = march(voxels, table, frame, origins, directions, shift, opacity, slope, step, stop)
     left = m.transmittance[:, -1]
     total = m.weight.sum(1)
     depth = torch.where(total != 0, (m.weight * m.t).sum(1) / torch.where(total != 0, total, 1), math.nan)
@@ -144,7 +144,7 @@ def march_backward(
     shift: Tensor,
     background: Tensor,
     opacity: int,
-    kappa: float,
+    slope: float,
     step: float,
     stop: float,
     groups: int = 1,
@@ -152,7 +152,7 @@ def march_backward(
     """Gradient by the voxels [T,4,4,4,P]; rays without a depth pass nothing on from grad_depth."""
     leaf = voxels.detach().requires_grad_()
     color, transmittance, depth = march_forward(
-        leaf, table, frame, origins, directions, shift, background, opacity, kappa, step, stop
+        leaf, table, frame, origins, directions, shift, background, opacity, slope, step, stop
     )
     solid = ~depth.isnan()
     outputs, grads = (color, transmittance, depth[solid]), (grad_color, grad_transmittance, grad_depth[solid])
@@ -171,10 +171,10 @@ def photometric_step(
     mask: Tensor,
     weight: Tensor,
     opacity: int,
-    kappa: float,
+    slope: float,
     step: float,
     stop: float,
-    huber_eps: float,
+    huber: float,
     weights: Sequence[float],
     detach_sample: bool,
     groups: int = 1,
@@ -185,12 +185,12 @@ def photometric_step(
     target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss.
     """
     leaf = voxels.detach().requires_grad_()
-    m = march(leaf, table, frame, origins, directions, shift, opacity, kappa, step, stop)
+    m = march(leaf, table, frame, origins, directions, shift, opacity, slope, step, stop)
     left = m.transmittance[:, -1]
     color = (m.weight[..., None] * m.color).sum(1) + left[:, None] * background
     w = m.weight.detach() if detach_sample else m.weight
-    photo = huber(color - target, huber_eps).sum(-1)
-    sample = (w * huber(m.color - target[:, None], huber_eps).sum(-1)).sum(1)
+    photo = huber_norm(color - target, huber).sum(-1)
+    sample = (w * huber_norm(m.color - target[:, None], huber).sum(-1)).sum(1)
     losses = torch.stack([(weight * term).sum() for term in (photo, sample, (left - (1 - mask)) ** 2)])
     (gradient,) = torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)
     return losses.detach().double(), gradient, color.detach(), left.detach()
@@ -204,12 +204,13 @@ def visibility(
     directions: Tensor,
     shift: Tensor,
     opacity: int,
-    kappa: float,
+    slope: float,
     step: float,
     stop: float,
+    groups: int = 1,
 ) -> Tensor:
     """[T,4,4,4,2]: per voxel the largest T_k and the largest w_k of the samples that read it."""
-    m = march(voxels, table, frame, origins, directions, shift, opacity, kappa, step, stop)
+    m = march(voxels, table, frame, origins, directions, shift, opacity, slope, step, stop)
     row = dense_index(table)[m.corners.unbind(-1)]  # [R,K,8]
     reads = (row >= 0) & (m.corner_weights > 0) & m.visited[..., None]
     seen = voxels.new_zeros(voxels.shape[0] * TILE**3, 2)

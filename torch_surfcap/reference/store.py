@@ -61,15 +61,20 @@ def sample_forward(voxels: Tensor, table: Tensor, frame: Sequence[float], points
 
 
 def sample_backward(
-    grad_values: Tensor, table: Tensor, frame: Sequence[float], points: Tensor, tiles: int
+    grad_values: Tensor,
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    points: Tensor,
+    groups: int = 1,
 ) -> Tensor:
-    """The adjoint of `sample_forward`: [N,P] -> [tiles,4,4,4,P]."""
-    voxels = grad_values.new_zeros(tiles, TILE, TILE, TILE, grad_values.shape[-1], requires_grad=True)
-    return torch.autograd.grad(sample_forward(voxels, table, frame, points), voxels, grad_values)[0]
+    """The adjoint of `sample_forward`: [N,P] -> [T,4,4,4,P]."""
+    leaf = voxels.detach().requires_grad_()
+    return torch.autograd.grad(sample_forward(leaf, table, frame, points), leaf, grad_values)[0]
 
 
 def nonempty_cells(table: Tensor) -> Tensor:
-    """[X,Y,Z] bool: whether any of the tiles t..t+1 is stored or inside; beyond the table tiles are outside."""
+    """[X,Y,Z] bool: whether any of the tiles t..t+1 is stored or inside; beyond the table all are outside."""
     solid = torch.nn.functional.pad((table > OUTSIDE)[None, None].double(), (0, 1) * 3)
     return torch.nn.functional.max_pool3d(solid, 2, stride=1)[0, 0] > 0
 
@@ -78,15 +83,16 @@ def upscale(
     voxels: Tensor,
     table: Tensor,
     frame: Sequence[float],
-    fine_coords: Tensor,
+    fine_coordinates: Tensor,
     fine_frame: Sequence[float],
-    fill_scale: float | None = None,
 ) -> Tensor:
     """The coarse field read at the centres of the fine tiles' voxels: [F,4,4,4,P].
 
-    fine_coords [F,3] are places in the fine table whose low corner is fine_frame[:3].
+    fine_coordinates [F,3] are places in the fine table whose low corner is fine_frame[:3].
     """
     local = torch.cartesian_prod(*[torch.arange(TILE, device=voxels.device)] * 3)  # [64, 3]
-    centers = (TILE * fine_coords[:, None] + local + 0.5) * fine_frame[3] + voxels.new_tensor(fine_frame[:3])
+    centers = (TILE * fine_coordinates[:, None] + local + 0.5) * fine_frame[3] + voxels.new_tensor(
+        fine_frame[:3]
+    )
     fine = sample_forward(voxels, table, frame, centers.view(-1, 3).to(voxels.dtype))
     return fine.view(-1, TILE, TILE, TILE, voxels.shape[-1])

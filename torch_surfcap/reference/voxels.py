@@ -10,7 +10,7 @@ from torch import Tensor
 from .store import dense, dense_index
 
 
-def huber(x: Tensor, eps: float) -> Tensor:
+def huber_norm(x: Tensor, eps: float) -> Tensor:
     """x²/2 for |x| < eps, eps (|x| - eps/2) above."""
     return torch.where(x.abs() < eps, 0.5 * x * x, eps * (x.abs() - 0.5 * eps))
 
@@ -18,21 +18,23 @@ def huber(x: Tensor, eps: float) -> Tensor:
 def voxel_terms(
     voxels: Tensor,
     table: Tensor,
-    coords: Tensor,
+    coordinates: Tensor,
     frame: Sequence[float],
     weights: Sequence[float],
-    parsimony_huber: float,
-    grad: Tensor,
+    huber: float,
+    gradient: Tensor,
 ) -> Tensor:
-    """Losses [5] in double, unweighted: TV of the opacity value, TV of colour, parsimony (eq. 11), ballooning
-    (eq. 12) and a fifth that is zero; adds the gradient of weights · losses to `grad` [T,4,4,4,P].
+    """Losses [4] in double, unweighted: TV of the opacity value, TV of colour, parsimony (eq. 11), ballooning
+    (eq. 12); adds the gradient of weights · losses to `gradient` [T,4,4,4,P].
 
     TV sums (x_i - x_j)² over unordered pairs of 6-neighbours of which at least one is stored. A missing
-    neighbour has its boundary value for the opacity value and does not count for colour. coords [T,3] place
-    the tiles in the table.
+    neighbour has its boundary value for the opacity value and does not count for colour. coordinates [T,3]
+    place the tiles in the table.
     """
-    if not bool((table[coords.long().unbind(-1)] == torch.arange(len(coords), device=table.device)).all()):
-        raise ValueError("coords: expected the place of every tile in the table")
+    if not bool(
+        (table[coordinates.long().unbind(-1)] == torch.arange(len(coordinates), device=table.device)).all()
+    ):
+        raise ValueError("coordinates: expected the place of every tile in the table")
     leaf = voxels.detach().requires_grad_()
     grid, stored = dense(leaf, table, frame), dense_index(table) >= 0
     tv_opacity, tv_color = leaf.new_zeros(()), leaf.new_zeros(())
@@ -42,24 +44,24 @@ def voxel_terms(
         first, second = stored.narrow(axis, 0, last), stored.narrow(axis, 1, last)
         tv_opacity = tv_opacity + squares[..., 0][first | second].sum()
         tv_color = tv_color + squares[..., 1:][first & second].sum()
-    parsimony = huber(leaf[..., 4:], parsimony_huber).sum()
+    parsimony = huber_norm(leaf[..., 4:], huber).sum()
     ballooning = (leaf[..., 0] ** 2).sum()
-    losses = torch.stack([tv_opacity, tv_color, parsimony, ballooning, leaf.new_zeros(())])
-    grad += torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)[0]
+    losses = torch.stack([tv_opacity, tv_color, parsimony, ballooning])
+    gradient += torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)[0]
     return losses.detach().double()
 
 
 def adam_step(
     voxels: Tensor,
-    grad: Tensor,
-    m: Tensor,
-    v: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
     rate: Tensor,
     low: Tensor,
     high: Tensor,
     beta1: float,
     beta2: float,
-    eps: float,
+    epsilon: float,
     t: int,
 ) -> None:
     """One bias-corrected step of Adam (Kingma and Ba 2015), the t-th from 1, in place; then the clamp to
@@ -67,9 +69,9 @@ def adam_step(
 
     rate, low, high [P] are per coefficient.
     """
-    m.mul_(beta1).add_(grad, alpha=1 - beta1)
-    v.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-    step = (m / (1 - beta1**t)) / ((v / (1 - beta2**t)).sqrt() + eps)
+    first.mul_(beta1).add_(gradient, alpha=1 - beta1)
+    second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    step = (first / (1 - beta1**t)) / ((second / (1 - beta2**t)).sqrt() + epsilon)
     voxels.copy_(torch.minimum(torch.maximum(voxels - rate * step, low), high))
 
 

@@ -1,0 +1,215 @@
+"""The settings of the commands under train/: typed, with defaults, read from YAML and from key=value
+arguments.
+
+Only the commands know this class; the library takes plain arguments. A value that is None in Python is
+written `auto` in YAML and is chosen by the program.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from torch_surfcap.data.files import atomic_write
+from torch_surfcap.errors import InputError
+
+
+def _one_of(default: Any, *values: Any) -> Any:
+    """A field that takes one of these values (or auto, where the default is None)."""
+    return field(default=default, metadata={"values": values})
+
+
+def _within(default: Any, low: float, high: float = float("inf")) -> Any:
+    """A field that takes a number low <= x <= high (or auto, where the default is None)."""
+    return field(default=default, metadata={"range": (low, high)})
+
+
+@dataclass
+class DataConfig:
+    path: str = ""  # the capture's folder or calibration file; must be given
+    format: str = _one_of("auto", "auto", "transforms", "idr", "middlebury", "rig")  # of the calibration
+    scale: float = _within(1.0, 1e-3, 1.0)  # size of the pictures used, as a fraction of the files'
+    holdout: int = _within(0, 0)  # every so many-th view is kept for testing; 0: those that the capture names
+    masks: bool = True  # use mask files and alpha channels
+    plates: bool = True  # use pictures of the empty room
+    box: list[float] | None = None  # [x0, y0, z0, x1, y1, z1] around the subject, capture's unit
+
+
+@dataclass
+class LossesConfig:
+    """Weights of terms that are normalised so that one set serves every level; auto depends on `opacity`."""
+
+    sample: float | None = _within(None, 0)  # weight of each sample's own colour against the photograph
+    mask: float | None = _within(None, 0)  # weight of transmittance against the silhouette
+    huber: float = _within(0.1, 1e-6)  # colour difference (0 to 1) above which Huber's norm is linear
+    tv_opacity: float | None = _within(None, 0)  # weight of squared steps of the opacity value between voxels
+    tv_color: float | None = _within(None, 0)  # weight of squared steps of the colour between voxels
+    parsimony: float | None = _within(None, 0)  # weight of Huber's norm of the view-dependent coefficients
+    ballooning: float | None = _within(None, 0)  # weight of squared transparency
+    eikonal: float | None = _within(None, 0)  # weight of a distance's slope against 1
+
+
+@dataclass
+class CamerasConfig:
+    skip: list[str] = field(default_factory=list)  # names or numbers of cameras to leave out
+
+
+@dataclass
+class MeshConfig:
+    threshold: float | None = None  # opacity value of the surface; auto: 0.81 transparency, 0 distance
+    smooth: int | None = _within(None, 0)  # rounds of Taubin smoothing
+    specks: float = _within(0.01, 0, 1)  # pieces below this fraction of the largest one's area are removed
+
+
+@dataclass
+class Config:
+    data: DataConfig = field(default_factory=DataConfig)
+    out: str = "out"  # folder of the results
+    device: str = _one_of("auto", "auto", "cpu", "cuda")
+    seed: int = _within(0, 0)
+    sh_degree: int | None = _one_of(None, 0, 1, 2)  # of the colour's dependence on the direction of view
+    voxel: float | None = _within(
+        None, 0
+    )  # edge of the finest voxels, capture's unit; auto: pixel's footprint
+    levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
+    opacity: str = _one_of("transparency", "transparency", "distance")  # what a voxel stores
+    losses: LossesConfig = field(default_factory=LossesConfig)
+    cameras: CamerasConfig = field(default_factory=CamerasConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    overwrite: bool = False  # replace the results in `out`
+    resume: bool = False  # go on from the checkpoint in `out`
+
+
+def load(path: str | os.PathLike[str] | None = None, overrides: Sequence[str] = ()) -> Config:
+    """The defaults, changed by a YAML file and then by "key=value" arguments (values are YAML too).
+
+    Raises InputError, naming the file or argument and the key, for what cannot be read, for unknown keys
+    (with the nearest known one) and for values of the wrong type or out of range.
+
+    >>> load(None, ["losses.huber=1e-1", "voxel=auto"]).losses.huber
+    0.1
+    """
+    merged = OmegaConf.structured(Config)
+    if path is not None:
+        merged = _merge(merged, _read(Path(path)), str(path))
+    for override in overrides:
+        if "=" not in override:
+            raise InputError(f"{override}: expected key=value")
+        try:
+            given = OmegaConf.from_dotlist([override])
+        except (OmegaConfBaseException, YAMLError, ValueError) as error:
+            raise InputError(f"{override}: not YAML: {error}") from error
+        merged = _merge(merged, given, override)
+    try:
+        config = OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        raise InputError(f"{path or 'settings'}: {error}") from error
+    assert isinstance(config, Config)
+    _check(config, str(path or "settings"))
+    return config
+
+
+def save(config: Config, path: str | os.PathLike[str]) -> None:
+    """Write every setting as YAML; `load` gives the same Config back."""
+    plain = OmegaConf.to_container(OmegaConf.structured(config))
+    assert isinstance(plain, dict)
+    with atomic_write(path) as partial:
+        partial.write_text(OmegaConf.to_yaml(_replace(plain, None, "auto")), encoding="utf-8")
+
+
+def keys(schema: Any = Config, prefix: str = "") -> Iterator[str]:
+    """Every key that may be set, such as "losses.huber"."""
+    for entry in fields(schema):
+        nested = entry.default_factory
+        if isinstance(nested, type) and is_dataclass(nested):
+            yield from keys(nested, f"{prefix}{entry.name}.")
+        else:
+            yield prefix + entry.name
+
+
+def _read(path: Path) -> DictConfig:
+    try:
+        given = OmegaConf.load(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot read this config file: {error.strerror}") from error
+    except (OmegaConfBaseException, YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a YAML file: {error}") from error
+    if not isinstance(given, DictConfig):
+        raise InputError(f"{path}: found a list, expected keys with values")
+    return given
+
+
+def _merge(config: DictConfig, given: DictConfig, source: str) -> DictConfig:
+    """`config` with what is `given`; `source` names it in messages."""
+    known = set(keys())
+    plain = OmegaConf.to_container(given)
+    assert isinstance(plain, dict)
+    for key, value in _flatten(plain):
+        if key not in known:
+            inner = [name for name in known if name.startswith(f"{key}.")]
+            if inner:
+                raise InputError(f"{source}: {key} is {value!r}, expected keys such as {min(inner)}")
+            raise InputError(f"{source}: unknown key {key}, nearest known key: {_nearest(key, known)}")
+        try:
+            OmegaConf.update(config, key, None if value == "auto" and key not in _SAYS_AUTO else value)
+        except OmegaConfBaseException as error:
+            reason = str(error).splitlines()[0]
+            raise InputError(f"{source}: {key} is {value!r}: {reason}") from error
+    return config
+
+
+def _nearest(key: str, known: set[str]) -> str:
+    """The known key most like `key`, by its whole name or by its last part."""
+    last = {name.rpartition(".")[2]: name for name in sorted(known)}
+    whole = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    part = difflib.get_close_matches(key.rpartition(".")[2], last, n=1, cutoff=0.0)
+    return whole[0] if whole else last[part[0]]
+
+
+def _flatten(plain: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in plain.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _replace(plain: Mapping[Any, Any], old: Any, new: Any) -> dict[Any, Any]:
+    return {
+        name: _replace(value, old, new) if isinstance(value, Mapping) else new if value is old else value
+        for name, value in plain.items()
+    }
+
+
+def _check(config: Any, source: str, prefix: str = "") -> None:
+    """Raise InputError for a value outside its field's choices or range."""
+    for entry in fields(config):
+        key, value = prefix + entry.name, getattr(config, entry.name)
+        if is_dataclass(value):
+            _check(value, source, f"{key}.")
+        if value is None:
+            continue
+        values, limits = entry.metadata.get("values"), entry.metadata.get("range")
+        if values and value not in values:
+            choices = ", ".join(map(str, values))
+            raise InputError(f"{source}: {key} is {value!r}, expected one of {choices}")
+        if limits and not limits[0] <= value <= limits[1]:
+            expected = f"a number from {limits[0]} to {limits[1]}"
+            raise InputError(f"{source}: {key} is {value!r}, expected {expected}")
+    if isinstance(config, DataConfig) and config.box is not None:
+        low, high = config.box[:3], config.box[3:]
+        if len(config.box) != 6 or not all(a < b for a, b in zip(low, high, strict=True)):
+            expected = "[x0, y0, z0, x1, y1, z1] with x0 < x1, y0 < y1, z0 < z1"
+            raise InputError(f"{source}: data.box is {config.box}, expected {expected}")
+
+
+# Fields in which "auto" is a word like any other.
+_SAYS_AUTO = {"data.format", "device"}
