@@ -1,0 +1,146 @@
+// From tensors to the views of core/views.h. Every check names the argument, what was expected and what came.
+#pragma once
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+#include <torch/headeronly/util/Exception.h>
+
+#include <initializer_list>
+#include <string>
+#include <vector>
+
+#include "core/views.h"
+
+namespace surfcap {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+constexpr int64_t kAny = -1;  // a size that any number satisfies
+constexpr int64_t kTileSide = 4, kVoxelsPerTile = 64;
+
+inline std::string shape_of(const Tensor& t) {
+  std::string text = "[";
+  for (int64_t i = 0; i < t.dim(); ++i) text += (i ? ", " : "") + std::to_string(t.size(i));
+  return text + "]";
+}
+
+inline void check_shape(const char* name, const Tensor& t, std::initializer_list<int64_t> expected) {
+  bool fits = t.dim() == int64_t(expected.size());
+  std::string text;
+  int64_t i = 0;
+  for (int64_t size : expected) {
+    fits = fits && (size == kAny || t.size(i) == size);
+    text += (i++ ? ", " : "") + (size == kAny ? std::string("*") : std::to_string(size));
+  }
+  STD_TORCH_CHECK(fits, name, ": expected shape [", text, "], got ", shape_of(t));
+}
+
+template <class Number> struct TypeOf;
+template <> struct TypeOf<float> {
+  static constexpr auto value = ScalarType::Float;
+  static constexpr const char* name = "float32";
+};
+template <> struct TypeOf<double> {
+  static constexpr auto value = ScalarType::Double;
+  static constexpr const char* name = "float64";
+};
+template <> struct TypeOf<int32_t> {
+  static constexpr auto value = ScalarType::Int;
+  static constexpr const char* name = "int32";
+};
+template <> struct TypeOf<int64_t> {
+  static constexpr auto value = ScalarType::Long;
+  static constexpr const char* name = "int64";
+};
+
+// A contiguous tensor of the right type, kept alive as long as the pointer is used.
+template <class Number> class Input {
+ public:
+  Input(const char* name, const Tensor& t, std::initializer_list<int64_t> shape)
+      : tensor_(t.is_contiguous() ? t : torch::stable::contiguous(t)) {
+    check_shape(name, t, shape);
+    STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name,
+                    ", as the other arguments are, got another type");
+  }
+  const Number* data() const { return tensor_.template const_data_ptr<Number>(); }
+  const Tensor& tensor() const { return tensor_; }
+
+ private:
+  Tensor tensor_;
+};
+
+// A tensor that an op writes into: no copy may stand between.
+template <class Number>
+Number* output(const char* name, const Tensor& t, std::initializer_list<int64_t> shape) {
+  check_shape(name, t, shape);
+  STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name);
+  STD_TORCH_CHECK(t.is_contiguous(), name, ": is written in place and must be contiguous");
+  return t.template mutable_data_ptr<Number>();
+}
+
+// frame = [origin x, y, z, voxel size, opacity value outside, inside]
+template <class Real>
+Field<Real> field_view(const Input<Real>& voxels, const Input<int32_t>& table, const std::vector<double>& frame) {
+  STD_TORCH_CHECK(frame.size() == 6, "frame: expected [origin x, y, z, voxel size, outside, inside], got ",
+                  frame.size(), " numbers");
+  STD_TORCH_CHECK(frame[3] > 0, "frame: expected a positive voxel size, got ", frame[3]);
+  const int64_t pitch = voxels.tensor().size(4);
+  STD_TORCH_CHECK(pitch == 4 || pitch == 16 || pitch == 32,
+                  "voxels: expected 4, 16 or 32 numbers per voxel (SH degree 0, 1, 2, padded), got ", pitch);
+  STD_TORCH_CHECK(voxels.tensor().size(0) < (int64_t(1) << 31) / kVoxelsPerTile,
+                  "voxels: expected fewer than 33554432 tiles, got ", voxels.tensor().size(0));
+  Field<Real> field;
+  field.voxels = voxels.data();
+  field.table = table.data();
+  for (int i = 0; i < 3; ++i) {
+    STD_TORCH_CHECK(table.tensor().size(i) >= 2, "table: expected at least 2 tiles a side, got ",
+                    shape_of(table.tensor()));
+    field.n[i] = int32_t(table.tensor().size(i));
+    field.origin[i] = Real(frame[i]);
+  }
+  field.per_unit = Real(1.0 / frame[3]);
+  field.missing[0] = Real(frame[4]);
+  field.missing[1] = Real(frame[5]);
+  field.tiles = voxels.tensor().size(0);
+  field.pitch = int32_t(pitch);
+  return field;
+}
+
+template <class Real> struct FieldArgument {
+  Input<Real> voxels;
+  Input<int32_t> table;
+  Field<Real> view;
+
+  FieldArgument(const Tensor& v, const Tensor& t, const std::vector<double>& frame)
+      : voxels("voxels", v, {kAny, kTileSide, kTileSide, kTileSide, kAny}),
+        table("table", t, {kAny, kAny, kAny}),
+        view(field_view(voxels, table, frame)) {}
+};
+
+template <class Real> struct RaysArgument {
+  Input<Real> origins, directions, shift, background;
+  Rays<Real> view;
+
+  RaysArgument(const Tensor& o, const Tensor& d, const Tensor& s, const Tensor& b)
+      : origins("origins", o, {kAny, 3}),
+        directions("directions", d, {o.size(0), 3}),
+        shift("shift", s, {o.size(0)}),
+        background("background", b, {o.size(0), 3}),
+        view{origins.data(), directions.data(), shift.data(), background.data(), o.size(0)} {}
+};
+
+template <class Real>
+RaySettings<Real> ray_settings(int64_t opacity, double slope, double step, double stop) {
+  STD_TORCH_CHECK(opacity == 0 || opacity == 1, "opacity: expected 0 (transparency) or 1 (distance), got ", opacity);
+  STD_TORCH_CHECK(step > 0, "step: expected a positive length, got ", step);
+  return {Real(step), Real(stop), Real(slope), int32_t(opacity)};
+}
+
+// Runs f<float> or f<double> by the type of `t`.
+#define SURFCAP_BY_TYPE(t, f, ...)                                                       \
+  ((t).scalar_type() == ScalarType::Double ? f<double>(__VA_ARGS__) : f<float>(__VA_ARGS__))
+
+}  // namespace surfcap

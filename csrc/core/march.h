@@ -1,0 +1,128 @@
+// One ray through the field, there and back.
+//
+// Forward (front to back), T_0 = 1:   T_{k+1} = a_k T_k,  w_k = (1 - a_k) T_k,  C = sum w_k c_k + T_K C_bg.
+// Any loss that is linear in the weights, sum_k w_k r_k + T_K r_inf, has by a_k the derivative T_k (R_k - r_k) with
+//   R_{K-1} = r_inf,   R_k = (1 - a_{k+1}) r_{k+1} + a_{k+1} R_{k+1},
+// so one walk from back to front over the remembered (a_k, c_k, T_k) gives every gradient, without the division by a_k
+// of the paper's eq. 17.
+#pragma once
+
+#include "lattice.h"
+#include "opacity.h"
+
+namespace surfcap {
+inline namespace SURFCAP_ISA {
+
+// What the walk back needs of a sample.
+template <class Real, class Opacity> struct Sample {
+  Pack<Real, 4> color;  // lane 0 unused, then r, g, b, as composited
+  Real t, a, transmittance;
+  typename Opacity::State before, now;
+  bool starts_run;
+};
+
+template <class Real> struct RayResult {
+  Pack<Real, 4> sum;   // lane 0: sum of w t, then sum of w c
+  Real transmittance;  // T_K
+  Real opacity;        // sum of w, not 1 - T_K: no cancellation
+  int samples;
+};
+
+// Room for the samples of one ray. The caller gives the memory: `capacity` samples, a multiple of kLanes.
+template <class Real, class Opacity> struct Trace {
+  Sample<Real, Opacity>* samples;
+  Footprints<Real>* footprints;  // capacity / kLanes
+};
+
+// The most samples a ray can have in this field, rounded up to whole groups of lanes, and one group to spare.
+template <class Real> SURFCAP_HD int64_t trace_capacity(const Field<Real>& field, Real step) {
+  Real squared = Real(0);
+  for (int i = 0; i < 3; ++i) squared += Real(kTile * field.n[i]) * Real(kTile * field.n[i]);
+  const int64_t longest = int64_t(std::ceil(std::sqrt(squared) / (step * field.per_unit))) + 2;
+  return (longest / kLanes + 2) * kLanes;
+}
+
+template <class Real, int Degree, class Opacity>
+SURFCAP_HD RayResult<Real> walk_forward(const Field<Real>& field, const Real* missing_records, const Line<Real>& line,
+                                        const Coefficients<Real, Degree>& weights, const RaySettings<Real>& settings,
+                                        Real shift, const Opacity& opacity, const Trace<Real, Opacity>& trace) {
+  Lattice<Real> lattice(field, line, settings.step, shift);
+  RayResult<Real> ray{zero_pack<Real, 4>(), Real(1), Real(0), 0};
+  typename Opacity::State before = opacity.outside();
+  Pack<Real, 4> color_before = zero_pack<Real, 4>();
+  int k_before = -2;
+  for (bool alive = true; alive;) {
+    int k[kLanes];
+    const int count = lattice.next(k, kLanes);
+    if (count == 0) break;
+    Real t[kLanes], u[3][kLanes];
+    for (int l = count; l < kLanes; ++l) k[l] = k[count - 1];
+    for (int l = 0; l < kLanes; ++l) t[l] = lattice.distance(k[l]);
+    for (int axis = 0; axis < 3; ++axis)
+      for (int l = 0; l < kLanes; ++l) u[axis][l] = line.at(axis, t[l]);
+    Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
+    locate(field, u, at);
+    for (int l = 0; l < count; ++l) {
+      Pack<Real, 4> color = fold<Real, Degree>(interpolate<Real, Degree>(field, missing_records, at, l), weights);
+      Sample<Real, Opacity>& sample = trace.samples[ray.samples++];
+      sample.starts_run = k[l] != k_before + 1;
+      k_before = k[l];
+      sample.before = sample.starts_run ? opacity.outside() : before;
+      sample.now = before = opacity.prepare(color[0]);
+      sample.a = opacity.transparency(sample.before, sample.now);
+      sample.t = t[l];
+      sample.transmittance = ray.transmittance;
+      if constexpr (Opacity::kMidpointColor) {
+        const Pack<Real, 4> here = color;
+        if (!sample.starts_run) color = Real(0.5) * (here + color_before);
+        color_before = here;
+      }
+      sample.color = color;
+      const Real w = (Real(1) - sample.a) * ray.transmittance;
+      color[0] = t[l];
+      ray.sum += w * color;
+      ray.opacity += w;
+      ray.transmittance *= sample.a;
+      if (ray.transmittance < settings.stop) {
+        alive = false;
+        break;
+      }
+    }
+    alive = alive && count == kLanes;
+  }
+  return ray;
+}
+
+// `term(sample, r, dc)` gives a sample's r_k and the derivative of r_k by its colour (lanes 1..3 of dc), and may give
+// a part of r_k that does not move the weights. Gradients are scattered into `gradient`.
+template <class Real, int Degree, class Opacity, class Term>
+SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const Opacity& opacity,
+                          const Coefficients<Real, Degree>& weights, Real r_inf, const Term& term, Real* gradient,
+                          Real* spare) {
+  Real behind = r_inf;
+  Pack<Real, 4> carried = zero_pack<Real, 4>();  // what the sample behind says about this sample's value and colour
+  for (int i = samples - 1; i >= 0; --i) {
+    const Sample<Real, Opacity>& sample = trace.samples[i];
+    const Real a = sample.a, T = sample.transmittance;
+    Pack<Real, 4> g = zero_pack<Real, 4>();
+    const Real r = term(sample, g);
+    const Real by_a = T * (behind - r);
+    behind = (Real(1) - a) * r + a * behind;
+    Real by_previous, by_current;
+    opacity.derivatives(sample.before, sample.now, a, by_previous, by_current);
+    g = ((Real(1) - a) * T) * g;
+    Pack<Real, 4> to_previous = zero_pack<Real, 4>();
+    if constexpr (Opacity::kMidpointColor) {
+      if (!sample.starts_run) to_previous = g = Real(0.5) * g;
+    }
+    to_previous[0] = by_a * by_previous;
+    g[0] = by_a * by_current;
+    g += carried;
+    carried = to_previous;
+    scatter<Real, Degree>(gradient, spare, trace.footprints[i / kLanes], i % kLanes,
+                          unfold<Real, Degree>(g, weights));
+  }
+}
+
+}  // namespace SURFCAP_ISA
+}  // namespace surfcap

@@ -1,0 +1,136 @@
+// What is done with one ray: rendering, its adjoint, the fused photometric step, and the visibility of voxels.
+#pragma once
+
+#include "march.h"
+
+namespace surfcap {
+inline namespace SURFCAP_ISA {
+
+// Huber's norm, x^2/2 below eps and eps (|x| - eps/2) above, and its derivative; both without a branch.
+template <class Real> SURFCAP_HD Real huber(Real x, Real eps, Real& derivative) {
+  derivative = clamped(x, -eps, eps);
+  return derivative * (x - Real(0.5) * derivative);
+}
+
+template <class Real> SURFCAP_HD Pack<Real, 4> color_of(const Real* rgb) {
+  Pack<Real, 4> p = zero_pack<Real, 4>();
+  for (int i = 0; i < 3; ++i) p[i + 1] = rgb[i];
+  return p;
+}
+
+template <class Real> SURFCAP_HD Real dot_color(const Pack<Real, 4>& a, const Pack<Real, 4>& b) {
+  const Pack<Real, 4> p = a * b;
+  return p[1] + p[2] + p[3];
+}
+
+template <class Real, int Degree, class Opacity> struct Marcher {
+  const Field<Real>& field;
+  const RaySettings<Real>& settings;
+  const Opacity& opacity;
+  const Trace<Real, Opacity>& trace;
+  Real missing_records[2 * Record<Degree>::kPitch];
+
+  SURFCAP_HD Marcher(const Field<Real>& f, const RaySettings<Real>& s, const Opacity& o, const Trace<Real, Opacity>& t)
+      : field(f), settings(s), opacity(o), trace(t) {
+    fill_missing<Real, Degree>(field, missing_records);
+  }
+
+  SURFCAP_HD RayResult<Real> forward(const Rays<Real>& rays, int64_t i,
+                                     const Coefficients<Real, Degree>& weights) const {
+    const Line<Real> line(field, rays.origins + 3 * i, rays.directions + 3 * i);
+    return walk_forward<Real, Degree, Opacity>(field, missing_records, line, weights, settings, rays.shift[i], opacity,
+                                               trace);
+  }
+};
+
+// Colour [3], transmittance and depth (sum of w t / sum of w, NaN where no sample has weight) of ray i.
+template <class Real, int Degree, class Opacity>
+SURFCAP_HD void render_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real* color,
+                           Real* transmittance, Real* depth) {
+  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
+  const RayResult<Real> ray = march.forward(rays, i, weights);
+  for (int c = 0; c < 3; ++c) color[3 * i + c] = ray.sum[c + 1] + ray.transmittance * rays.background[3 * i + c];
+  transmittance[i] = ray.transmittance;
+  depth[i] = ray.opacity > Real(0) ? ray.sum[0] / ray.opacity : Real(__builtin_nan(""));
+}
+
+// The adjoint of render_ray by the voxels: adds to `gradient`.
+template <class Real, int Degree, class Opacity>
+SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
+                                    const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth,
+                                    Real* gradient, Real* spare) {
+  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
+  const RayResult<Real> ray = march.forward(rays, i, weights);
+  // depth D = S/O with S = sum w t and O = sum w: dD = (t - D)/O per unit of w. Empty rays have no depth to pull on.
+  const bool solid = ray.opacity > Real(0);
+  const Real by_depth = solid ? grad_depth[i] / ray.opacity : Real(0);
+  const Real depth = solid ? ray.sum[0] / ray.opacity : Real(0);
+  const Pack<Real, 4> by_color = color_of(grad_color + 3 * i);
+  const Real r_inf = dot_color<Real>(by_color, color_of(rays.background + 3 * i)) + grad_transmittance[i];
+  const auto term = [&](const Sample<Real, Opacity>& sample, Pack<Real, 4>& dc) {
+    dc = by_color;
+    return dot_color<Real>(by_color, sample.color) + by_depth * (sample.t - depth);
+  };
+  walk_back<Real, Degree, Opacity>(march.trace, ray.samples, march.opacity, weights, r_inf, term, gradient, spare);
+}
+
+// One ray of the fused step: adds (photo, sample, mask), each times the ray's weight, to `losses`, the gradient of their
+// weighted sum to `gradient`, and writes colour and transmittance.
+template <class Real, int Degree, class Opacity>
+SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays,
+                                const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t i,
+                                double* losses, Real* color, Real* transmittance, Real* gradient, Real* spare) {
+  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
+  const RayResult<Real> ray = march.forward(rays, i, weights);
+  const Pack<Real, 4> target = color_of(seen.target + 3 * i), background = color_of(rays.background + 3 * i);
+  const Pack<Real, 4> rendered = ray.sum + ray.transmittance * background;
+  const Real weight = seen.weight[i];
+  Pack<Real, 4> by_color = zero_pack<Real, 4>();
+  Real photo = Real(0);
+  for (int c = 1; c < 4; ++c) {
+    Real derivative;
+    photo += huber(rendered[c] - target[c], loss.huber, derivative);
+    by_color[c] = weight * loss.photo * derivative;
+    color[3 * i + c - 1] = rendered[c];
+  }
+  transmittance[i] = ray.transmittance;
+  const Real excess = ray.transmittance - Real(1) + seen.mask[i];
+  const Real r_inf = dot_color<Real>(by_color, background) + Real(2) * weight * loss.mask * excess;
+  const Real sample_weight = weight * loss.sample;
+  Real sample_loss = Real(0);
+  const auto term = [&](const Sample<Real, Opacity>& sample, Pack<Real, 4>& dc) {
+    Real distance = Real(0);
+    for (int c = 1; c < 4; ++c) {
+      Real derivative;
+      distance += huber(sample.color[c] - target[c], loss.huber, derivative);
+      dc[c] = by_color[c] + sample_weight * derivative;
+    }
+    sample_loss += (Real(1) - sample.a) * sample.transmittance * distance;
+    return dot_color<Real>(by_color, sample.color) + (loss.detach_sample ? Real(0) : sample_weight * distance);
+  };
+  walk_back<Real, Degree, Opacity>(march.trace, ray.samples, march.opacity, weights, r_inf, term, gradient, spare);
+  losses[0] += double(weight * photo);
+  losses[1] += double(weight * sample_loss);
+  losses[2] += double(weight * excess * excess);
+}
+
+// Raises, at every voxel that a sample of ray i reads with a positive weight, seen[0] to T_k and seen[1] to w_k.
+template <class Real, int Degree, class Opacity>
+SURFCAP_HD void visibility_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
+                               Real* seen) {
+  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
+  const RayResult<Real> ray = march.forward(rays, i, weights);
+  for (int k = 0; k < ray.samples; ++k) {
+    const Sample<Real, Opacity>& sample = march.trace.samples[k];
+    const Footprints<Real>& at = march.trace.footprints[k / kLanes];
+    for (int c = 0; c < 8; ++c) {
+      const int64_t voxel = at.voxel[c][k % kLanes];
+      if (voxel < 0 || !(at.weight[c][k % kLanes] > Real(0))) continue;
+      seen[2 * voxel] = larger(seen[2 * voxel], sample.transmittance);
+      seen[2 * voxel + 1] = larger(seen[2 * voxel + 1], (Real(1) - sample.a) * sample.transmittance);
+    }
+  }
+}
+
+}  // namespace SURFCAP_ISA
+}  // namespace surfcap

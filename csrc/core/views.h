@@ -1,0 +1,67 @@
+// What the drivers hand to the mathematics: plain views of tensors and plain settings, without a function, so that they
+// are the same types for every instruction set. Pointers are row-major and contiguous.
+#pragma once
+
+#include <cstdint>
+
+namespace surfcap {
+
+// The sparse field: a record of `pitch` numbers per voxel, 4x4x4 voxels to a tile, a table of tile indices.
+template <class Real> struct Field {
+  const Real* voxels;    // [tiles, 4, 4, 4, pitch]
+  const int32_t* table;  // [n0, n1, n2], its outermost tiles outside
+  int32_t n[3];
+  Real origin[3];   // low corner of the table, world
+  Real per_unit;    // voxels per world unit
+  Real missing[2];  // opacity value where there is no tile: outside, inside
+  int64_t tiles;
+  int32_t pitch;  // 4, 16 or 32 for spherical harmonics of degree 0, 1 or 2
+};
+
+template <class Real> struct Rays {
+  const Real* origins;     // [R, 3] world
+  const Real* directions;  // [R, 3] world, unit
+  const Real* shift;       // [R] displacement of the lattice in steps
+  const Real* background;  // [R, 3] or null where only visibility is asked for
+  int64_t count;
+};
+
+template <class Real> struct RaySettings {
+  Real step;        // distance between samples, world units
+  Real stop;        // the ray ends when its transmittance has fallen below this; 0: never
+  Real slope;       // of the signed distance's logistic, per voxel
+  int32_t opacity;  // 0: the value is a transparency, 1: a signed distance
+};
+
+template <class Real> struct Observation {
+  const Real* target;  // [R, 3] the photograph
+  const Real* mask;    // [R] 1 = subject
+  const Real* weight;  // [R] of the ray in every loss
+};
+
+template <class Real> struct PhotometricSettings {
+  Real huber;                // where Huber's norm turns linear
+  Real photo, sample, mask;  // weights of the losses
+  bool detach_sample;        // the weights w_k of the sample loss carry no gradient
+};
+
+template <class Real> struct VoxelTerms {
+  Real tv_opacity, tv_color, parsimony, ballooning;  // weights
+  Real huber;                                        // where the parsimony's norm turns linear
+};
+
+template <class Real> struct AdamSettings {
+  Real beta1, beta2, epsilon;
+  Real correction1, correction2;  // 1/(1 - beta^t)
+  const Real *rate, *low, *high;  // [pitch] per coefficient
+};
+
+template <class Real> struct Silhouettes {
+  const Real* projections;  // [V, 3, 4] world to pixels, pixel (0, 0) centred at (1/2, 1/2)
+  const Real* masks;        // all masks end to end
+  const int64_t* offsets;   // [V] where each begins
+  const int64_t* sizes;     // [V, 2] width, height
+  int64_t views;
+};
+
+}  // namespace surfcap

@@ -1,0 +1,214 @@
+// The body of the kernel tables, compiled once per instruction set by isa_*.cpp, which set SURFCAP_ISA and the target.
+#include "../core/rays.h"
+#include "../core/silhouettes.h"
+#include "../core/voxels.h"
+#include "kernels.h"
+
+namespace surfcap {
+inline namespace SURFCAP_ISA {
+
+template <int N> struct Constant {
+  static constexpr int value = N;
+};
+
+// Calls f with the spherical harmonics' degree as a constant.
+template <class F> void with_degree(int32_t pitch, const F& f) {
+  if (pitch == Record<0>::kPitch) f(Constant<0>{});
+  if (pitch == Record<1>::kPitch) f(Constant<1>{});
+  if (pitch == Record<2>::kPitch) f(Constant<2>{});
+}
+
+// Memory that a thread keeps between calls, aligned to a cache line.
+class Workspace {
+ public:
+  ~Workspace() { std::free(memory_); }
+  char* reserve(size_t bytes) {
+    if (bytes > size_) {
+      std::free(memory_);
+      size_ = (bytes + 4095) / 4096 * 4096;
+      memory_ = static_cast<char*>(std::aligned_alloc(64, size_));
+      if (!memory_) throw std::bad_alloc();
+    }
+    return memory_;
+  }
+
+ private:
+  char* memory_ = nullptr;
+  size_t size_ = 0;
+};
+
+static thread_local Workspace workspace;
+
+// Calls f(marcher) with the degree and the opacity's kind resolved and room for the longest ray.
+template <class Real, class F>
+void with_marcher(const Field<Real>& field, const RaySettings<Real>& settings, const F& f) {
+  const int64_t capacity = trace_capacity(field, settings.step);
+  const auto with_opacity = [&](const auto& opacity) {
+    using Opacity = std::decay_t<decltype(opacity)>;
+    const size_t sample_bytes = capacity * sizeof(Sample<Real, Opacity>);
+    char* memory = workspace.reserve(sample_bytes + capacity / kLanes * sizeof(Footprints<Real>) + 64);
+    const Trace<Real, Opacity> trace{reinterpret_cast<Sample<Real, Opacity>*>(memory),
+                                     reinterpret_cast<Footprints<Real>*>(memory + (sample_bytes + 63) / 64 * 64)};
+    with_degree(field.pitch, [&](auto degree) {
+      f(Marcher<Real, decltype(degree)::value, Opacity>(field, settings, opacity, trace));
+    });
+  };
+  if (settings.opacity == 0)
+    with_opacity(Transparency<Real>{});
+  else
+    with_opacity(SignedDistance<Real>{settings.slope});
+}
+
+template <class Real>
+void march_forward(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, int64_t begin,
+                   int64_t end, Real* color, Real* transmittance, Real* depth) {
+  with_marcher(field, settings, [&](const auto& march) {
+    for (int64_t i = begin; i < end; ++i) render_ray(march, rays, i, color, transmittance, depth);
+  });
+}
+
+template <class Real>
+void march_backward(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                    const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth, int64_t begin,
+                    int64_t end, Real* gradient) {
+  Real spare[32] = {};
+  with_marcher(field, settings, [&](const auto& march) {
+    for (int64_t i = begin; i < end; ++i)
+      render_ray_backward(march, rays, i, grad_color, grad_transmittance, grad_depth, gradient, spare);
+  });
+}
+
+template <class Real>
+void photometric_step(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                      const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin, int64_t end,
+                      double* losses, Real* color, Real* transmittance, Real* gradient) {
+  Real spare[32] = {};
+  with_marcher(field, settings, [&](const auto& march) {
+    for (int64_t i = begin; i < end; ++i)
+      photometric_ray(march, rays, seen, loss, i, losses, color, transmittance, gradient, spare);
+  });
+}
+
+template <class Real>
+void visibility(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, int64_t begin,
+                int64_t end, Real* seen) {
+  with_marcher(field, settings, [&](const auto& march) {
+    for (int64_t i = begin; i < end; ++i) visibility_ray(march, rays, i, seen);
+  });
+}
+
+// Calls f(footprints, count, first) for every kLanes of the points begin..end, given by point(i, xyz).
+template <class Real, class Point, class F>
+void for_points(const Field<Real>& field, int64_t begin, int64_t end, const Point& point, const F& f) {
+  for (int64_t first = begin; first < end; first += kLanes) {
+    const int count = int(end - first < kLanes ? end - first : kLanes);
+    Real u[3][kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+      Real x[3];
+      point(first + (l < count ? l : 0), x);
+      for (int axis = 0; axis < 3; ++axis) u[axis][l] = (x[axis] - field.origin[axis]) * field.per_unit - Real(0.5);
+    }
+    Footprints<Real> at;
+    locate(field, u, at);
+    f(at, count, first);
+  }
+}
+
+template <class Real, class Point>
+void read_points(const Field<Real>& field, int64_t begin, int64_t end, const Point& point, Real* values) {
+  with_degree(field.pitch, [&](auto degree) {
+    using R = Record<decltype(degree)::value>;
+    Real missing[2 * R::kPitch];
+    fill_missing<Real, decltype(degree)::value>(field, missing);
+    for_points(field, begin, end, point, [&](const Footprints<Real>& at, int count, int64_t first) {
+      for (int l = 0; l < count; ++l) {
+        const auto record = interpolate<Real, decltype(degree)::value>(field, missing, at, l);
+        for (int p = 0; p < R::kParts; ++p)
+          store<Real, R::kPart>(values + (first + l) * R::kPitch + p * R::kPart, record.part[p]);
+      }
+    });
+  });
+}
+
+template <class Real>
+void sample_forward(const Field<Real>& field, const Real* points, int64_t begin, int64_t end, Real* values) {
+  const auto point = [&](int64_t i, Real* x) {
+    for (int axis = 0; axis < 3; ++axis) x[axis] = points[3 * i + axis];
+  };
+  read_points(field, begin, end, point, values);
+}
+
+template <class Real>
+void sample_backward(const Field<Real>& field, const Real* points, const Real* grad_values, int64_t begin, int64_t end,
+                     Real* gradient) {
+  Real spare[32] = {};
+  const auto point = [&](int64_t i, Real* x) {
+    for (int axis = 0; axis < 3; ++axis) x[axis] = points[3 * i + axis];
+  };
+  with_degree(field.pitch, [&](auto degree) {
+    constexpr int D = decltype(degree)::value;
+    using R = Record<D>;
+    for_points(field, begin, end, point, [&](const Footprints<Real>& at, int count, int64_t first) {
+      for (int l = 0; l < count; ++l) {
+        Coefficients<Real, D> g;
+        for (int p = 0; p < R::kParts; ++p)
+          g.part[p] = load<Real, R::kPart>(grad_values + (first + l) * R::kPitch + p * R::kPart);
+        scatter<Real, D>(gradient, spare, at, l, g);
+      }
+    });
+  });
+}
+
+// The values of the fine tiles begin..end, read from the coarse field at the fine voxels' centres.
+template <class Real>
+void upscale(const Field<Real>& coarse, const Field<Real>& fine, const int32_t* coordinates, int64_t begin,
+             int64_t end, Real* voxels) {
+  const auto center = [&](int64_t i, Real* x) {
+    const int v = int(i % kTileVoxels), place[3] = {v / (kTile * kTile), (v / kTile) % kTile, v % kTile};
+    for (int axis = 0; axis < 3; ++axis) {
+      const Real voxel = Real(kTile * coordinates[i / kTileVoxels * 3 + axis] + place[axis]) + Real(0.5);
+      x[axis] = fine.origin[axis] + voxel / fine.per_unit;
+    }
+  };
+  read_points(coarse, begin * kTileVoxels, end * kTileVoxels, center, voxels);
+}
+
+template <class Real>
+void voxel_terms(const Field<Real>& field, const int32_t* coordinates, const VoxelTerms<Real>& terms, int64_t begin,
+                 int64_t end, double* losses, Real* gradient) {
+  with_degree(field.pitch, [&](auto degree) {
+    for (int64_t t = begin; t < end; ++t)
+      voxel_terms_tile<Real, decltype(degree)::value>(field, coordinates + 3 * t, terms, t, losses, gradient);
+  });
+}
+
+template <class Real>
+void adam_step(Real* value, const Real* gradient, Real* first, Real* second, int32_t pitch, int64_t begin, int64_t end,
+               const AdamSettings<Real>& adam) {
+  const int64_t at = begin * pitch;
+  with_degree(pitch, [&](auto degree) {
+    adam_records<Real, Record<decltype(degree)::value>::kPitch>(value + at, gradient + at, first + at, second + at,
+                                                                end - begin, adam);
+  });
+}
+
+template <class Real>
+void soft_hull(const Silhouettes<Real>& silhouettes, const Real* points, int64_t begin, int64_t end, Real* value,
+               int32_t* votes) {
+  for (int64_t i = begin; i < end; ++i) value[i] = soft_hull_point(silhouettes, points + 3 * i, votes[i]);
+}
+
+}  // namespace SURFCAP_ISA
+
+namespace SURFCAP_ISA {
+template <class Real> const Kernels<Real>& kernels() {
+  static constexpr Kernels<Real> table{
+      SURFCAP_ISA_NAME,      sample_forward<Real>, sample_backward<Real>,  march_forward<Real>,
+      march_backward<Real>,  photometric_step<Real>, visibility<Real>,     voxel_terms<Real>,
+      adam_step<Real>,       soft_hull<Real>,        upscale<Real>};
+  return table;
+}
+template const Kernels<float>& kernels<float>();
+template const Kernels<double>& kernels<double>();
+}  // namespace SURFCAP_ISA
+}  // namespace surfcap

@@ -1,0 +1,51 @@
+// How the drivers spread work over threads.
+//
+// Sums must not depend on the number of threads. Whatever adds into a common gradient is therefore split into a fixed
+// number of groups, each with a buffer of its own, and the buffers are added in a fixed order.
+#pragma once
+
+#include <algorithm>
+
+#include "../arguments.h"
+#include "kernels.h"
+
+namespace surfcap {
+
+constexpr int64_t kChunk = 256;  // rays or points that one group takes at a time, to even out the load
+
+template <class F> void parallel_ranges(int64_t count, int64_t grain, const F& f) {
+  if (count > 0) torch::stable::parallel_for(0, count, grain, [&](int64_t begin, int64_t end) { f(begin, end); });
+}
+
+
+// Calls work(begin, end, buffer, group) for all chunks of 0..count, chunk c in group c mod groups, each group with its
+// own zeroed buffer of `size` numbers, the first being `total`; then combines the buffers into `total` group by group.
+template <class Real, class Work, class Combine>
+void grouped(const Tensor& like, int64_t count, int64_t groups, int64_t size, Real* total, const Work& work,
+             const Combine& combine) {
+  STD_TORCH_CHECK(groups >= 1, "groups: expected at least 1, got ", groups);
+  const int64_t chunks = (count + kChunk - 1) / kChunk;
+  groups = std::max<int64_t>(1, std::min(groups, chunks));
+  const Tensor rest = torch::stable::new_empty(like, {groups - 1, size});
+  Real* const buffers = groups > 1 ? rest.template mutable_data_ptr<Real>() : nullptr;
+  parallel_ranges(groups, 1, [&](int64_t first, int64_t last) {
+    for (int64_t g = first; g < last; ++g) {
+      Real* const buffer = g == 0 ? total : buffers + (g - 1) * size;
+      std::fill(buffer, buffer + size, Real(0));
+      for (int64_t c = g; c < chunks; c += groups) work(c * kChunk, std::min(count, (c + 1) * kChunk), buffer, g);
+    }
+  });
+  parallel_ranges(size, 1 << 14, [&](int64_t begin, int64_t end) {
+    for (int64_t g = 1; g < groups; ++g) {
+      const Real* const buffer = buffers + (g - 1) * size;
+      for (int64_t i = begin; i < end; ++i) total[i] = combine(total[i], buffer[i]);
+    }
+  });
+}
+
+template <class Real, class Work>
+void grouped_sum(const Tensor& like, int64_t count, int64_t groups, int64_t size, Real* total, const Work& work) {
+  grouped(like, count, groups, size, total, work, [](Real a, Real b) { return a + b; });
+}
+
+}  // namespace surfcap

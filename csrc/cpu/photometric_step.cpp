@@ -1,0 +1,55 @@
+// photometric_step: photometric, sample and mask loss of many rays, and the gradient of their weighted sum, in one call.
+#include <tuple>
+
+#include "parallel.h"
+
+namespace surfcap {
+
+using StepResult = std::tuple<Tensor, Tensor, Tensor, Tensor>;  // losses, gradient, colour, transmittance
+
+template <class Real>
+StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
+                                  const Tensor& origins, const Tensor& directions, const Tensor& shift,
+                                  const Tensor& background, const Tensor& target, const Tensor& mask,
+                                  const Tensor& weight, int64_t opacity, double slope, double step, double stop,
+                                  double huber, const std::vector<double>& weights, bool detach_sample,
+                                  int64_t groups) {
+  const FieldArgument<Real> field(voxels, table, frame);
+  const RaysArgument<Real> rays(origins, directions, shift, background);
+  const RaySettings<Real> settings = ray_settings<Real>(opacity, slope, step, stop);
+  const int64_t count = rays.view.count;
+  const Input<Real> photograph("target", target, {count, 3});
+  const Input<Real> silhouette("mask", mask, {count});
+  const Input<Real> importance("weight", weight, {count});
+  STD_TORCH_CHECK(weights.size() == 3, "weights: expected [photo, sample, mask], got ", weights.size(), " numbers");
+  const Observation<Real> seen{photograph.data(), silhouette.data(), importance.data()};
+  const PhotometricSettings<Real> loss{Real(huber), Real(weights[0]), Real(weights[1]), Real(weights[2]),
+                                       detach_sample};
+
+  const Tensor gradient = torch::stable::empty_like(field.voxels.tensor());
+  const Tensor color = torch::stable::new_empty(voxels, {count, 3});
+  const Tensor transmittance = torch::stable::new_empty(voxels, {count});
+  const Tensor losses = torch::stable::new_zeros(voxels, {3}, ScalarType::Double);
+  Real *const c = color.template mutable_data_ptr<Real>(), *const t = transmittance.template mutable_data_ptr<Real>();
+  std::vector<double> by_group(size_t(std::max<int64_t>(groups, 1)) * 3, 0.0);
+  grouped_sum<Real>(voxels, count, groups, gradient.numel(), gradient.template mutable_data_ptr<Real>(),
+                    [&](int64_t begin, int64_t end, Real* buffer, int64_t group) {
+                      best_kernels<Real>().photometric_step(field.view, rays.view, settings, seen, loss, begin, end,
+                                                            by_group.data() + 3 * group, c, t, buffer);
+                    });
+  double* const sum = losses.template mutable_data_ptr<double>();
+  for (size_t i = 0; i < by_group.size(); ++i) sum[i % 3] += by_group[i];
+  return {losses, gradient, color, transmittance};
+}
+
+StepResult photometric_step(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins, Tensor directions,
+                            Tensor shift, Tensor background, Tensor target, Tensor mask, Tensor weight, int64_t opacity,
+                            double slope, double step, double stop, double huber, std::vector<double> weights,
+                            bool detach_sample, int64_t groups) {
+  return SURFCAP_BY_TYPE(voxels, photometric_step_typed, voxels, table, frame, origins, directions, shift, background,
+                         target, mask, weight, opacity, slope, step, stop, huber, weights, detach_sample, groups);
+}
+
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("photometric_step", TORCH_BOX(&photometric_step)); }
+
+}  // namespace surfcap

@@ -1,0 +1,24 @@
+// The schemas of all ops. What each does is said once, in torch_surfcap/ops.py; cpu/NAME.cpp and core/ implement it.
+#include <torch/csrc/stable/library.h>
+
+// The arguments that describe a field, a bundle of rays and the march stand at the beginning of most schemas.
+#define FIELD "Tensor voxels, Tensor table, float[] frame"
+#define RAYS "Tensor origins, Tensor directions, Tensor shift, Tensor background"
+#define MARCH "int opacity, float slope, float step, float stop"
+
+STABLE_TORCH_LIBRARY(torch_surfcap, m) {
+  m.def("sample_forward(" FIELD ", Tensor points) -> Tensor");
+  m.def("sample_backward(Tensor grad_values, " FIELD ", Tensor points, int groups) -> Tensor");
+  m.def("march_forward(" FIELD ", " RAYS ", " MARCH ") -> (Tensor, Tensor, Tensor)");
+  m.def("march_backward(Tensor grad_color, Tensor grad_transmittance, Tensor grad_depth, " FIELD ", " RAYS ", " MARCH
+        ", int groups) -> Tensor");
+  m.def("photometric_step(" FIELD ", " RAYS ", Tensor target, Tensor mask, Tensor weight, " MARCH
+        ", float huber, float[] weights, bool detach_sample, int groups) -> (Tensor, Tensor, Tensor, Tensor)");
+  m.def("visibility(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH ", int groups) -> Tensor");
+  m.def("voxel_terms(" FIELD
+        ", Tensor coordinates, float[] weights, float huber, Tensor(a!) gradient) -> Tensor");
+  m.def("adam_step(Tensor(a!) voxels, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor low, "
+        "Tensor high, float beta1, float beta2, float epsilon, int t) -> ()");
+  m.def("soft_hull(Tensor points, Tensor projections, Tensor masks, Tensor sizes) -> (Tensor, Tensor)");
+  m.def("upscale(" FIELD ", Tensor fine_coordinates, float[] fine_frame) -> Tensor");
+}

@@ -1,0 +1,286 @@
+"""The raw operators ``torch.ops.torch_surfcap.*``: what each computes, its shapes, and its shape function.
+
+Every op exists once in ``csrc/core`` (mathematics), ``csrc/cpu`` (driver), :mod:`torch_surfcap.reference` (oracle) and
+``tests/ops``, under the same name. Gradients belong to :mod:`torch_surfcap.autograd`; nothing here is differentiable.
+
+The field arguments, the same for every op:
+
+* ``voxels [T, 4, 4, 4, P]``: a record of P = 4, 16, 32 numbers (SH degree 0, 1, 2) per voxel of a tile [x, y, z]:
+  the opacity value, then ``beta[lm, rgb]``, then zero padding.
+* ``table [X, Y, Z]`` int32: tile index, ``INSIDE``, or ``OUTSIDE - d``, which promises that every cell nearer than d
+  cells is empty as well. (Cell t is empty if the 8 tiles t .. t + 1 are outside.) The outermost tiles are outside.
+* ``frame``: [x, y, z of the table's low corner, voxel size, opacity value outside, opacity value inside].
+
+The ray arguments: ``origins, directions [R, 3]`` (unit), ``shift [R]`` of the lattice t_k = (k + 1/2 + shift) * step in
+steps, ``background [R, 3]``, ``opacity`` 0 (the value is a transparency) or 1 (a signed distance in voxels with logistic
+``slope``), ``step`` in world units, ``stop``: a ray ends once its transmittance is lower (0: never).
+
+``groups`` is the number of partial gradients that are summed in a fixed order: results depend on it in the last bits,
+and never on the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor
+
+import torch_surfcap._C  # noqa: F401  (loads the library, which registers the ops)
+
+INSIDE = -1
+OUTSIDE = -2
+TILE = 4
+OPACITY = {"transparency": 0, "distance": 1}
+GROUPS = 4
+
+_ops = torch.ops.torch_surfcap
+
+
+def coefficients(sh_degree: int) -> int:
+    """Numbers that a voxel holds: the opacity value and three colour channels per harmonic."""
+    return 1 + 3 * (sh_degree + 1) ** 2
+
+
+def pitch(sh_degree: int) -> int:
+    """Numbers that a voxel's record occupies, padding included."""
+    return (4, 16, 32)[sh_degree]
+
+
+def degree_of(count: int) -> int:
+    """SH degree of a voxel of ``count`` numbers, padded or not."""
+    for sh_degree in range(3):
+        if count in (coefficients(sh_degree), pitch(sh_degree)):
+            return sh_degree
+    raise ValueError(f"voxels: expected 4, 13, 16, 28 or 32 numbers per voxel (SH degree 0, 1, 2), got {count}")
+
+
+def padded(voxels: Tensor) -> Tensor:
+    """Records filled up to their pitch; the tensor itself where it is padded already. Differentiable."""
+    missing = pitch(degree_of(voxels.shape[-1])) - voxels.shape[-1]
+    return torch.nn.functional.pad(voxels, (0, missing)) if missing else voxels
+
+
+def sample_forward(voxels: Tensor, table: Tensor, frame: list[float], points: Tensor) -> Tensor:
+    """Trilinear read at ``points [N, 3]``: records [N, P]; a missing corner is black with the boundary's opacity."""
+    return cast(Tensor, _ops.sample_forward(voxels, table, frame, points))
+
+
+def sample_backward(
+    grad_values: Tensor, voxels: Tensor, table: Tensor, frame: list[float], points: Tensor, groups: int = GROUPS
+) -> Tensor:
+    """Adjoint of :func:`sample_forward` by the voxels: [T, 4, 4, 4, P]."""
+    return cast(Tensor, _ops.sample_backward(grad_values, voxels, table, frame, points, groups))
+
+
+def march_forward(
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    background: Tensor,
+    opacity: int,
+    slope: float,
+    step: float,
+    stop: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The ray integral (paper eq. 4 to 6 with the exclusive transmittance): colour [R, 3], transmittance [R] and depth
+    [R] = sum w t / sum w, NaN where a ray meets nothing."""
+    field, rays = (voxels, table, frame), (origins, directions, shift, background)
+    return cast("tuple[Tensor, Tensor, Tensor]", _ops.march_forward(*field, *rays, opacity, slope, step, stop))
+
+
+def march_backward(
+    grad_color: Tensor,
+    grad_transmittance: Tensor,
+    grad_depth: Tensor,
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    background: Tensor,
+    opacity: int,
+    slope: float,
+    step: float,
+    stop: float,
+    groups: int = GROUPS,
+) -> Tensor:
+    """Adjoint of :func:`march_forward` by the voxels (eq. 17 without its division): [T, 4, 4, 4, P]."""
+    grads, field = (grad_color, grad_transmittance, grad_depth), (voxels, table, frame)
+    rays, march = (origins, directions, shift, background), (opacity, slope, step, stop)
+    return cast(Tensor, _ops.march_backward(*grads, *field, *rays, *march, groups))
+
+
+def photometric_step(
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    background: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    weight: Tensor,
+    opacity: int,
+    slope: float,
+    step: float,
+    stop: float,
+    huber: float,
+    weights: list[float],
+    detach_sample: bool = False,
+    groups: int = GROUPS,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Value and gradient of the ray losses in one call.
+
+    Args:
+        target: [R, 3] the photograph's colours. mask: [R], 1 = subject. weight: [R] of the ray in every loss.
+        huber: where Huber's norm (x^2/2 below) turns linear.
+        weights: of the photometric loss sum Huber(C - target) (eq. 8), of the sample loss
+            sum_k w_k Huber(c_k - target) (eq. 10, observed colour) and of the mask loss (T - (1 - mask))^2.
+        detach_sample: the sample loss's w_k carry no gradient.
+
+    Returns:
+        losses [3] float64, not yet times ``weights``; the gradient of ``weights . losses`` [T, 4, 4, 4, P]; the colours
+        [R, 3] and transmittances [R] of the rays.
+    """
+    field, rays, seen = (voxels, table, frame), (origins, directions, shift, background), (target, mask, weight)
+    march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample)
+    return cast(
+        "tuple[Tensor, Tensor, Tensor, Tensor]", _ops.photometric_step(*field, *rays, *seen, *march, *loss, groups)
+    )
+
+
+def visibility(
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    opacity: int,
+    slope: float,
+    step: float,
+    stop: float,
+    groups: int = GROUPS,
+) -> Tensor:
+    """Per voxel the largest T_k and the largest w_k of the samples that read it: [T, 4, 4, 4, 2]."""
+    field, rays = (voxels, table, frame), (origins, directions, shift)
+    return cast(Tensor, _ops.visibility(*field, *rays, opacity, slope, step, stop, groups))
+
+
+def voxel_terms(
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    coordinates: Tensor,
+    weights: list[float],
+    huber: float,
+    gradient: Tensor,
+) -> Tensor:
+    """Losses of the voxels themselves; the gradient of ``weights . losses`` is added to ``gradient``.
+
+    Args:
+        coordinates: [T, 3] int32, where each tile stands in the table.
+        weights: of the total variation of the opacity value and of the colour coefficients (sum over 6-neighbour pairs
+            of the squared difference, eq. 9; missing neighbours count with their boundary value for the opacity, not
+            for colour), of the parsimony (eq. 11, Huber over ``huber``, l > 0) and of the ballooning (eq. 12).
+        gradient: [T, 4, 4, 4, P], written in place.
+
+    Returns:
+        losses [4] float64 in the order of ``weights``, not yet times them.
+    """
+    return cast(Tensor, _ops.voxel_terms(voxels, table, frame, coordinates, weights, huber, gradient))
+
+
+def adam_step(
+    voxels: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    rate: Tensor,
+    low: Tensor,
+    high: Tensor,
+    t: int,
+    beta1: float = 0.9,
+    beta2: float = 0.99,
+    epsilon: float = 1e-8,
+) -> None:
+    """Step t = 1, 2, ... of Adam in place on ``voxels``, moments ``first`` and ``second``, then clamp to [low, high].
+
+    ``rate, low, high [P]`` are given per coefficient of a record.
+    """
+    _ops.adam_step(voxels, gradient, first, second, rate, low, high, beta1, beta2, epsilon, t)
+
+
+def soft_hull(points: Tensor, projections: Tensor, masks: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+    """The soft visual hull at ``points [N, 3]``: (value [N], number of cameras that see the point [N] int32).
+
+    The value is the least of the bilinearly read masks of the cameras that see the point, 0 where none does.
+
+    Args:
+        projections: [V, 3, 4] world to pixels. masks: all masks end to end. sizes: [V, 2] int64 width, height.
+    """
+    return cast("tuple[Tensor, Tensor]", _ops.soft_hull(points, projections, masks, sizes))
+
+
+def upscale(
+    voxels: Tensor, table: Tensor, frame: list[float], fine_coordinates: Tensor, fine_frame: list[float]
+) -> Tensor:
+    """Trilinear read of a field at the voxel centres of finer tiles ``[F, 3]`` (table coordinates): [F, 4, 4, 4, P]."""
+    return cast(Tensor, _ops.upscale(voxels, table, frame, fine_coordinates, fine_frame))
+
+
+def _register_shapes() -> None:
+    """Shape functions, so that torch.compile and opcheck know what the ops return."""
+    fake = torch.library.register_fake
+
+    @fake("torch_surfcap::sample_forward")
+    def _(voxels, table, frame, points):  # type: ignore[no-untyped-def]
+        return voxels.new_empty(points.shape[0], voxels.shape[-1])
+
+    @fake("torch_surfcap::sample_backward")
+    def _(grad_values, voxels, table, frame, points, groups):  # type: ignore[no-untyped-def]
+        return voxels.new_empty(voxels.shape)
+
+    @fake("torch_surfcap::march_forward")
+    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
+        rays = origins.shape[0]
+        return voxels.new_empty(rays, 3), voxels.new_empty(rays), voxels.new_empty(rays)
+
+    @fake("torch_surfcap::march_backward")
+    def _(grad_color, grad_transmittance, grad_depth, voxels, *rest):  # type: ignore[no-untyped-def]
+        return voxels.new_empty(voxels.shape)
+
+    @fake("torch_surfcap::photometric_step")
+    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
+        rays = origins.shape[0]
+        losses = voxels.new_empty(3, dtype=torch.float64)
+        return losses, voxels.new_empty(voxels.shape), voxels.new_empty(rays, 3), voxels.new_empty(rays)
+
+    @fake("torch_surfcap::visibility")
+    def _(voxels, *rest):  # type: ignore[no-untyped-def]
+        return voxels.new_empty(*voxels.shape[:4], 2)
+
+    @fake("torch_surfcap::voxel_terms")
+    def _(voxels, *rest):  # type: ignore[no-untyped-def]
+        return voxels.new_empty(4, dtype=torch.float64)
+
+    @fake("torch_surfcap::adam_step")
+    def _(*arguments):  # type: ignore[no-untyped-def]
+        return None
+
+    @fake("torch_surfcap::soft_hull")
+    def _(points, *rest):  # type: ignore[no-untyped-def]
+        return points.new_empty(points.shape[0]), points.new_empty(points.shape[0], dtype=torch.int32)
+
+    @fake("torch_surfcap::upscale")
+    def _(voxels, table, frame, fine_coordinates, fine_frame):  # type: ignore[no-untyped-def]
+        return voxels.new_empty(fine_coordinates.shape[0], *voxels.shape[1:])
+
+
+_register_shapes()
