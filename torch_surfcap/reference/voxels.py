@@ -59,10 +59,10 @@ def adam_step(
     rate: Tensor,
     low: Tensor,
     high: Tensor,
-    beta1: float,
-    beta2: float,
-    epsilon: float,
     t: int,
+    beta1: float = 0.9,
+    beta2: float = 0.99,
+    epsilon: float = 1e-8,
 ) -> None:
     """One bias-corrected step of Adam (Kingma and Ba 2015), the t-th from 1, in place; then the clamp to
     [low, high].
