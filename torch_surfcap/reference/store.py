@@ -91,8 +91,7 @@ def upscale(
     fine_coordinates [F,3] are places in the fine table whose low corner is fine_frame[:3].
     """
     local = torch.cartesian_prod(*[torch.arange(TILE, device=voxels.device)] * 3)  # [64, 3]
-    centers = (TILE * fine_coordinates[:, None] + local + 0.5) * fine_frame[3] + voxels.new_tensor(
-        fine_frame[:3]
-    )
-    fine = sample_forward(voxels, table, frame, centers.view(-1, 3).to(voxels.dtype))
+    place = (TILE * fine_coordinates[:, None] + local).to(voxels.dtype)  # [F, 64, 3]
+    centers = voxels.new_tensor(fine_frame[:3]) + (place + 0.5) * fine_frame[3]
+    fine = sample_forward(voxels, table, frame, centers.view(-1, 3))
     return fine.view(-1, TILE, TILE, TILE, voxels.shape[-1])

@@ -18,8 +18,8 @@ def huber_norm(x: Tensor, eps: float) -> Tensor:
 def voxel_terms(
     voxels: Tensor,
     table: Tensor,
-    coordinates: Tensor,
     frame: Sequence[float],
+    coordinates: Tensor,
     weights: Sequence[float],
     huber: float,
     gradient: Tensor,
