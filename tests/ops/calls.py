@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from tests.ops.fields import Scene
+from torch_surfcap import ops as _ops
 from torch_surfcap import reference
 from torch_surfcap.reference import TRANSPARENCY
 
+ops: Any = _ops  # untyped: the tests unpack lists of arguments into its functions
 WRITES = {"voxel_terms": [6], "adam_step": [0, 2, 3]}  # arguments that an op changes in place
 NAMES = (
     "sample_forward",

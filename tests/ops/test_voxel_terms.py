@@ -1,0 +1,77 @@
+"""voxel_terms: total variation, parsimony and ballooning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.ops.calls import arguments, ops
+from tests.ops.fields import assert_close, make_scene, one_tile
+from torch_surfcap.autograd import VoxelTerms
+from torch_surfcap.reference import INSIDE
+
+
+def test_by_hand(device: str) -> None:
+    # One tile of a = 1/2 between outside (1) and, on its high x side, inside (0): 6 faces of 16 pairs, each (1/2)^2, so
+    # TV = 24. Voxel (1, 1, 1) has red 0.3 where the others have 0: 6 pairs of 0.09 = 0.54; nothing at the tile's edge,
+    # since colour has no missing neighbours. Degree 1: one coefficient 0.05, Huber 0.05^2/2 = 0.00125, and one -0.2,
+    # 0.1 (0.2 - 0.05) = 0.015, in voxels of their own inside the tile: 6 pairs of 0.0025 and of 0.04, 0.255 more.
+    # Ballooning: 64 / 4 = 16.
+    voxels, table, frame = one_tile(degree=1, device=device)
+    table[2, 1, 1] = INSIDE
+    voxels[..., 0] = 0.5
+    voxels[0, 1, 1, 1, 1] = 0.3
+    voxels[0, 2, 2, 2, 4] = 0.05
+    voxels[0, 1, 2, 1, 9] = -0.2
+    coordinates = torch.ones(1, 3, dtype=torch.int32, device=device)
+    gradient = torch.zeros_like(voxels)
+    losses = ops.voxel_terms(voxels, table, frame, coordinates, [1.0, 1.0, 1.0, 1.0], 0.1, gradient)
+    assert_close(losses, torch.tensor([24.0, 0.54 + 0.255, 0.01625, 16.0], dtype=torch.float64))
+    # Corner (0, 0, 0) has three outside neighbours: 2 * 3 * (1/2 - 1) + 2 * 1/2 = -2. In the middle only ballooning: 1.
+    # Red of voxel (1, 1, 1): 2 * 6 * 0.3. Coefficient 4 of (2, 2, 2): 2 * 6 * 0.05 + 0.05; 9 of (1, 2, 1): -2.4 - 0.1.
+    for at, expected in {
+        (0, 0, 0, 0): -2.0,
+        (1, 1, 1, 0): 1.0,
+        (3, 1, 1, 0): 2 * (0.5 - 0) + 1,
+        (1, 1, 1, 1): 3.6,
+        (2, 2, 2, 4): 0.65,
+        (1, 2, 1, 9): -2.5,
+        (0, 1, 1, 1): -0.6,
+    }.items():
+        assert gradient[0][at].item() == pytest.approx(expected), at
+
+
+def test_gradient_is_added(device: str) -> None:
+    given = arguments("voxel_terms", make_scene(device=device))
+    fresh, added = torch.zeros_like(given[6]), given[6].clone()
+    ops.voxel_terms(*given[:6], fresh)
+    ops.voxel_terms(*given[:6], added)
+    assert_close(added - given[6], fresh.cpu())
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_gradcheck(degree: int, device: str) -> None:
+    scene = make_scene(degree, device=device, side=2)
+
+    def total(voxels: Tensor) -> Any:
+        return VoxelTerms.apply(
+            voxels, scene.table, scene.frame, scene.coordinates, [0.3, 0.7, 0.2, 0.4], 0.1
+        )[0]
+
+    assert torch.autograd.gradcheck(total, scene.voxels.requires_grad_(), fast_mode=True)
+
+
+def test_wrong_arguments_are_named(device: str) -> None:
+    good = arguments("voxel_terms", make_scene(device=device))
+    for i, wrong, match in (
+        (3, good[3][1:], "coordinates: expected shape"),
+        (3, torch.zeros_like(good[3]), "coordinates: expected every tile inside"),
+        (4, [1.0], "weights: expected"),
+        (6, good[6][..., :2], "gradient: expected shape"),
+        (6, good[6].transpose(1, 2), "gradient: is written in place and must be contiguous"),
+    ):
+        with pytest.raises(RuntimeError, match=match):
+            ops.voxel_terms(*good[:i], wrong, *good[i + 1 :])
