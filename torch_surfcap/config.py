@@ -76,9 +76,7 @@ class Config:
     device: str = _one_of("auto", "auto", "cpu", "cuda")
     seed: int = _within(0, 0)
     sh_degree: int | None = _one_of(None, 0, 1, 2)  # of the colour's dependence on the direction of view
-    voxel: float | None = _within(
-        None, 0
-    )  # edge of the finest voxels, capture's unit; auto: pixel's footprint
+    voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
     opacity: str = _one_of("transparency", "transparency", "distance")  # what a voxel stores
     losses: LossesConfig = field(default_factory=LossesConfig)
@@ -125,12 +123,12 @@ def save(config: Config, path: str | os.PathLike[str]) -> None:
         partial.write_text(OmegaConf.to_yaml(_replace(plain, None, "auto")), encoding="utf-8")
 
 
-def keys(schema: Any = Config, prefix: str = "") -> Iterator[str]:
+def key_names(schema: Any = Config, prefix: str = "") -> Iterator[str]:
     """Every key that may be set, such as "losses.huber"."""
     for entry in fields(schema):
         nested = entry.default_factory
         if isinstance(nested, type) and is_dataclass(nested):
-            yield from keys(nested, f"{prefix}{entry.name}.")
+            yield from key_names(nested, f"{prefix}{entry.name}.")
         else:
             yield prefix + entry.name
 
@@ -149,7 +147,7 @@ def _read(path: Path) -> DictConfig:
 
 def _merge(config: DictConfig, given: DictConfig, source: str) -> DictConfig:
     """`config` with what is `given`; `source` names it in messages."""
-    known = set(keys())
+    known = set(key_names())
     plain = OmegaConf.to_container(given)
     assert isinstance(plain, dict)
     for key, value in _flatten(plain):
