@@ -1,4 +1,4 @@
-"""Exact distances from points to triangle meshes."""
+"""Exact distances from points to triangle meshes, and the triangles' normals."""
 
 from __future__ import annotations
 
@@ -56,6 +56,13 @@ def closest_on_triangles(points: Array, triangles: Array) -> Array:
 def row_dot(a: Array, b: Array) -> Array:
     """Dot product [P] of the rows of two arrays [P, 3]."""
     return np.asarray(np.einsum("ij,ij->i", a, b))
+
+
+def face_normals(triangles: Array) -> Array:
+    """Unit normals [F, 3] of triangles [F, 3, 3]; zero for a triangle without area."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    return np.asarray(cross / np.where(length > 0, length, 1.0))
 
 
 @dataclass

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from torch_surfcap.distance import Array, SurfaceDistance, row_dot
+from torch_surfcap.distance import Array, SurfaceDistance, face_normals, row_dot
 
 
 def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
@@ -48,13 +48,6 @@ def ssim(image: Tensor, truth: Tensor) -> float:
             use_sample_covariance=False,
         )
     )
-
-
-def face_normals(triangles: Array) -> Array:
-    """Unit normals [F, 3] of triangles [F, 3, 3]; zero for a triangle without area."""
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    length = np.linalg.norm(cross, axis=1, keepdims=True)
-    return np.asarray(cross / np.where(length > 0, length, 1.0))
 
 
 def surface_scores(

@@ -1,0 +1,1 @@
+"""From the field to the mesh and to pictures: extraction and rendering."""
