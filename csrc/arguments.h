@@ -8,6 +8,7 @@
 #include <torch/headeronly/util/Exception.h>
 
 #include <initializer_list>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -17,6 +18,7 @@ namespace surfcap {
 
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
+using Shape = std::initializer_list<int64_t>;
 
 constexpr int64_t kAny = -1;  // a size that any number satisfies
 constexpr int64_t kTileSide = 4, kVoxelsPerTile = 64;
@@ -27,7 +29,7 @@ inline std::string shape_of(const Tensor& t) {
   return text + "]";
 }
 
-inline void check_shape(const char* name, const Tensor& t, std::initializer_list<int64_t> expected) {
+inline void check_shape(const char* name, const Tensor& t, Shape expected) {
   bool fits = t.dim() == int64_t(expected.size());
   std::string text;
   int64_t i = 0;
@@ -59,7 +61,7 @@ template <> struct TypeOf<int64_t> {
 // A contiguous tensor of the right type, kept alive as long as the pointer is used.
 template <class Number> class Input {
  public:
-  Input(const char* name, const Tensor& t, std::initializer_list<int64_t> shape)
+  Input(const char* name, const Tensor& t, Shape shape)
       : tensor_(t.is_contiguous() ? t : torch::stable::contiguous(t)) {
     check_shape(name, t, shape);
     STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name,
@@ -74,7 +76,7 @@ template <class Number> class Input {
 
 // A tensor that an op writes into: no copy may stand between.
 template <class Number>
-Number* output(const char* name, const Tensor& t, std::initializer_list<int64_t> shape) {
+Number* output(const char* name, const Tensor& t, Shape shape) {
   check_shape(name, t, shape);
   STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name);
   STD_TORCH_CHECK(t.is_contiguous(), name, ": is written in place and must be contiguous");
@@ -129,7 +131,24 @@ template <class Real> struct RaysArgument {
         directions("directions", d, {o.size(0), 3}),
         shift("shift", s, {o.size(0)}),
         background("background", b, {o.size(0), 3}),
-        view{origins.data(), directions.data(), shift.data(), background.data(), o.size(0)} {}
+        view{origins.data(), directions.data(), shift.data(), background.data(), o.size(0), nullptr, nullptr} {}
+};
+
+// The integration ranges of rays, where the caller has them.
+template <class Real> struct RangesArgument {
+  std::optional<Input<int64_t>> offsets;
+  std::optional<Input<Real>> ranges;
+
+  RangesArgument(const std::optional<Tensor>& o, const std::optional<Tensor>& r, Rays<Real>& rays) {
+    STD_TORCH_CHECK(o.has_value() == r.has_value(), "range_offsets, ranges: expected both or neither");
+    if (!o) return;
+    offsets.emplace("range_offsets", *o, Shape{rays.count + 1});
+    ranges.emplace("ranges", *r, Shape{kAny, 2});
+    STD_TORCH_CHECK(offsets->data()[rays.count] == r->size(0), "range_offsets: expected to end with ", r->size(0),
+                    ", the number of ranges, got ", offsets->data()[rays.count]);
+    rays.range_offsets = offsets->data();
+    rays.ranges = ranges->data();
+  }
 };
 
 template <class Real>

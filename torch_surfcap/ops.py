@@ -134,6 +134,7 @@ def photometric_step(
     weights: list[float],
     detach_sample: bool = False,
     groups: int = GROUPS,
+    ranges: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Value and gradient of the ray losses in one call.
 
@@ -143,6 +144,7 @@ def photometric_step(
         weights: of the photometric loss sum Huber(C - target) (eq. 8), of the sample loss
             sum_k w_k Huber(c_k - target) (eq. 10, observed colour) and of the mask loss (T - (1 - mask))^2.
         detach_sample: the sample loss's w_k carry no gradient.
+        ranges: of the rays, as :func:`integration_ranges` gives them; they save the search for non-empty cells.
 
     Returns:
         losses [3] float64, not yet times ``weights``; the gradient of ``weights . losses`` [T, 4, 4, 4, P]; the colours
@@ -150,9 +152,22 @@ def photometric_step(
     """
     field, rays, seen = (voxels, table, frame), (origins, directions, shift, background), (target, mask, weight)
     march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample)
+    stretches = ranges or (None, None)
     return cast(
-        "tuple[Tensor, Tensor, Tensor, Tensor]", _ops.photometric_step(*field, *rays, *seen, *march, *loss, groups)
+        "tuple[Tensor, Tensor, Tensor, Tensor]",
+        _ops.photometric_step(*field, *rays, *seen, *stretches, *march, *loss, groups),
     )
+
+
+def integration_ranges(
+    voxels: Tensor, table: Tensor, frame: list[float], origins: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The stretches of rays in non-empty cells (paper, section 4.1), front to back, neighbours joined.
+
+    Returns:
+        offsets [R + 1] int64, where each ray's ranges begin, and ranges [M, 2]: begin and end, world units from the origin.
+    """
+    return cast("tuple[Tensor, Tensor]", _ops.integration_ranges(voxels, table, frame, origins, directions))
 
 
 def visibility(
@@ -261,6 +276,11 @@ def _register_shapes() -> None:
         rays = origins.shape[0]
         losses = voxels.new_empty(3, dtype=torch.float64)
         return losses, voxels.new_empty(voxels.shape), voxels.new_empty(rays, 3), voxels.new_empty(rays)
+
+    @fake("torch_surfcap::integration_ranges")
+    def _(voxels, table, frame, origins, directions):  # type: ignore[no-untyped-def]
+        count = torch.library.get_ctx().new_dynamic_size()
+        return origins.new_empty(origins.shape[0] + 1, dtype=torch.int64), origins.new_empty(count, 2)
 
     @fake("torch_surfcap::visibility")
     def _(voxels, *rest):  # type: ignore[no-untyped-def]

@@ -27,36 +27,36 @@ template <class Real> struct Footprints {
   Real weight[8][kLanes];
 };
 
-// u[axis][lane] -> footprints. Written as plain loops over the lanes, which the compiler turns into vector code.
+// Positions u[axis] of kLanes points -> footprints.
 template <class Real>
-SURFCAP_HD void locate(const Field<Real>& field, const Real (&u)[3][kLanes], Footprints<Real>& out) {
+SURFCAP_HD void locate(const Field<Real>& field, const Pack<Real, kLanes> (&u)[3], Footprints<Real>& out) {
+  using Index = Pack<int32_t, kLanes>;
+  using Number = Pack<Real, kLanes>;
   const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
   const int32_t inner[3] = {kTile * kTile, kTile, 1};
-  int32_t tile[3][2][kLanes], local[3][2][kLanes];
-  Real weight[3][2][kLanes];
+  const Index none = fill_pack<int32_t, kLanes>(0);
+  const Number zero = zero_pack<Real, kLanes>(), one = fill_pack<Real, kLanes>(Real(1));
+  Index tile[3][2], local[3][2];  // of the lower and the upper corner along each axis
+  Number weight[3][2];
   for (int axis = 0; axis < 3; ++axis) {
-    const int32_t last = kTile * (field.n[axis] - 1) - 1;
-    for (int l = 0; l < kLanes; ++l) {
-      int32_t base = int32_t(u[axis][l]);
-      base = base < 0 ? 0 : base;
-      base = base > last ? last : base;
-      const Real f = clamped(u[axis][l] - Real(base), Real(0), Real(1));
-      weight[axis][0][l] = Real(1) - f;
-      weight[axis][1][l] = f;
-      tile[axis][0][l] = (base >> 2) * stride[axis];
-      tile[axis][1][l] = ((base + 1) >> 2) * stride[axis];
-      local[axis][0][l] = (base & 3) * inner[axis];
-      local[axis][1][l] = ((base + 1) & 3) * inner[axis];
+    const Index last = fill_pack<int32_t, kLanes>(kTile * (field.n[axis] - 1) - 1);
+    Index base = convert_pack<int32_t, kLanes, Real>(u[axis]);
+    base = smaller_pack<int32_t, kLanes>(larger_pack<int32_t, kLanes>(base, none), last);
+    const Number f = u[axis] - convert_pack<Real, kLanes, int32_t>(base);
+    weight[axis][1] = smaller_pack<Real, kLanes>(larger_pack<Real, kLanes>(f, zero), one);
+    weight[axis][0] = one - weight[axis][1];
+    for (int side = 0; side < 2; ++side) {
+      tile[axis][side] = ((base + side) >> 2) * stride[axis];
+      local[axis][side] = ((base + side) & 3) * inner[axis];
     }
   }
   for (int c = 0; c < 8; ++c) {
     const int cx = c >> 2, cy = (c >> 1) & 1, cz = c & 1;
-    for (int l = 0; l < kLanes; ++l) {
-      const int32_t t = field.table[tile[0][cx][l] + tile[1][cy][l] + tile[2][cz][l]];
-      const int32_t voxel = t * kTileVoxels + local[0][cx][l] + local[1][cy][l] + local[2][cz][l];
-      out.voxel[c][l] = t < 0 ? t : voxel;
-      out.weight[c][l] = weight[0][cx][l] * weight[1][cy][l] * weight[2][cz][l];
-    }
+    const Index t = look_up<kLanes>(field.table, tile[0][cx] + tile[1][cy] + tile[2][cz]);
+    // A stored tile has voxel >= t, a missing one (t < 0) voxel <= t: the greater is the index, or t's own meaning.
+    const Index voxel = t * kTileVoxels + (local[0][cx] + local[1][cy] + local[2][cz]);
+    store<int32_t, kLanes>(out.voxel[c], larger_pack<int32_t, kLanes>(t, voxel));
+    store<Real, kLanes>(out.weight[c], weight[0][cx] * weight[1][cy] * weight[2][cz]);
   }
 }
 

@@ -1,60 +1,114 @@
 // The samples of a ray: t_k = (k + 1/2 + shift) * step from its origin, those in empty cells left out.
 #pragma once
 
-#include <cmath>
-
 #include "field.h"
 
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-// A ray in voxel-centre units: u(t) = origin + t * direction with t in world units.
+// A ray in voxel-centre units: u(t) = origin + t * direction with t in world units; lane 3 is idle. A direction along
+// an axis gets a hair of slope, so that no case needs a test for zero.
 template <class Real> struct Line {
-  Real origin[3], direction[3];
+  Pack<Real, 4> origin, direction;
 
   SURFCAP_HD Line(const Field<Real>& field, const Real* o, const Real* d) {
+    constexpr Real kHair = Real(1e-20);
+    origin = zero_pack<Real, 4>();
+    direction = fill_pack<Real, 4>(Real(1));
     for (int i = 0; i < 3; ++i) {
       origin[i] = (o[i] - field.origin[i]) * field.per_unit - Real(0.5);
-      direction[i] = d[i] * field.per_unit;
+      const Real slope = d[i] * field.per_unit;
+      direction[i] = slope < kHair && slope > -kHair ? kHair : slope;
     }
   }
-  SURFCAP_HD Real at(int axis, Real t) const { return origin[axis] + t * direction[axis]; }
 };
 
-// Walks the lattice from front to back and hands out the indices k of the samples in non-empty cells.
+// The cells of the table that a ray passes, from front to back; empty neighbourhoods are left in one stride.
+template <class Real> class Cells {
+ public:
+  SURFCAP_HD Cells(const Field<Real>& field, const Line<Real>& line) : field_(field), line_(line) {
+    inverse_ = fill_pack<Real, 4>(Real(1)) / line.direction;
+    Real high[4] = {};
+    int32_t last_cell[4] = {}, forward[4] = {};
+    for (int axis = 0; axis < 3; ++axis) {
+      high[axis] = Real(kTile * (field.n[axis] - 1));
+      last_cell[axis] = field.n[axis] - 2;
+      forward[axis] = line.direction[axis] > Real(0);
+    }
+    last_cell_ = load<int32_t, 4>(last_cell);
+    forward_ = load<int32_t, 4>(forward);
+    const Pack<Real, 4> a = zero_pack<Real, 4>() - line.origin * inverse_,
+                        b = (load<Real, 4>(high) - line.origin) * inverse_;
+    const Pack<Real, 4> first = smaller_pack<Real, 4>(a, b), last = larger_pack<Real, 4>(a, b);
+    near = larger(larger(first[0], first[1]), larger(first[2], Real(0)));
+    far = smaller(smaller(last[0], last[1]), last[2]);
+  }
+
+  // Looks at the cell at distance t, says in `leave` where the ray leaves it, or the empty neighbourhood it is the
+  // middle of, and returns whether it is empty.
+  SURFCAP_HD bool empty(Real t, Real& leave) const {
+    using Index = Pack<int32_t, 4>;
+    Index cell = convert_pack<int32_t, 4, Real>(line_.origin + t * line_.direction) >> 2;
+    cell = smaller_pack<int32_t, 4>(larger_pack<int32_t, 4>(cell, fill_pack<int32_t, 4>(0)), last_cell_);
+    const int32_t entry = field_.table[(cell[0] * field_.n[1] + cell[1]) * field_.n[2] + cell[2]];
+    const bool is_empty = entry < kOutside;
+    const int32_t reach = is_empty ? kOutside - entry - 1 : 0;  // cells around this one that are empty too
+    const Index border = (cell + forward_ * (2 * reach + 1) - reach) * kTile;
+    const Pack<Real, 4> at = (convert_pack<Real, 4, int32_t>(border) - line_.origin) * inverse_;
+    leave = smaller(smaller(at[0], at[1]), at[2]);
+    return is_empty;
+  }
+
+  Real near, far;  // where the ray enters and leaves the table; near >= far: it misses
+
+ private:
+  const Field<Real>& field_;
+  const Line<Real>& line_;
+  Pack<Real, 4> inverse_;
+  Pack<int32_t, 4> last_cell_, forward_;  // forward: 1 where the ray runs up the axis
+};
+
+// Integration ranges (paper, section 4.1): the stretches [begin, end) of a ray that lie in non-empty cells, neighbours
+// joined. Writes them where `out` is given and returns their number.
+template <class Real> SURFCAP_HD int integration_ranges(const Cells<Real>& cells, Real voxel, Real* out) {
+  int count = 0;
+  bool open = false;
+  Real t = cells.near;
+  while (t < cells.far) {
+    Real leave;
+    const bool empty = cells.empty(t, leave);
+    if (!empty && !open) {
+      if (out) out[2 * count] = t;
+      ++count;
+    }
+    open = !empty;
+    t = larger(leave, t) + Real(1e-3) * voxel;  // a hair past the border, so that the next look is beyond it
+    if (out && open) out[2 * count - 1] = smaller(t, cells.far);
+  }
+  return count;
+}
+
+// Hands out, front to back, the indices k of the samples in non-empty cells: by looking at the cells, or from the ray's
+// integration ranges where they are known.
 template <class Real> class Lattice {
  public:
-  SURFCAP_HD Lattice(const Field<Real>& field, const Line<Real>& line, Real step, Real shift)
-      : field_(field), line_(line), step_(step), offset_(Real(0.5) + shift) {
-    Real near = Real(0), far = Real(3.0e38);
-    for (int axis = 0; axis < 3; ++axis) {
-      inverse_[axis] = Real(1) / line.direction[axis];
-      const Real high = Real(kTile * (field.n[axis] - 1));
-      if (line.direction[axis] == Real(0)) {
-        if (!(line.origin[axis] >= Real(0) && line.origin[axis] < high)) far = Real(-1);
-        continue;
-      }
-      const Real a = -line.origin[axis] * inverse_[axis], b = (high - line.origin[axis]) * inverse_[axis];
-      near = larger(near, smaller(a, b));
-      far = smaller(far, larger(a, b));
-    }
-    k_ = near < far ? index_after(near) : 0;
-    end_ = near < far ? index_after(far) : 0;
-    k_ = k_ < 0 ? 0 : k_;
+  SURFCAP_HD Lattice(const Cells<Real>& cells, Real step, Real shift, const Real* ranges, int32_t range_count)
+      : cells_(cells), ranges_(ranges), left_(range_count), step_(step), per_step_(Real(1) / step),
+        offset_(Real(0.5) + shift) {
+    const bool hit = cells.near < cells.far;
+    k_ = hit ? larger(index_after(cells.near), 0) : 0;
+    end_ = hit ? index_after(cells.far) : 0;
     known_until_ = k_;
   }
 
-  SURFCAP_HD Real distance(int k) const { return (Real(k) + offset_) * step_; }
+  SURFCAP_HD Real offset() const { return offset_; }
 
-  // Writes up to `capacity` indices of samples in non-empty cells; fewer mean that the ray has left the table.
-  SURFCAP_HD int next(int* k_out, int capacity) {
+  // Writes up to `capacity` indices; fewer mean that the ray is at its end.
+  SURFCAP_HD int next(int32_t* k_out, int capacity) {
     int count = 0;
     while (count < capacity && k_ < end_) {
-      if (k_ >= known_until_) {
-        const int depth = look();
-        if (depth > 0) continue;
-      }
-      const int until = known_until_ < k_ + capacity - count ? known_until_ : k_ + capacity - count;
+      if (k_ >= known_until_ && (ranges_ ? !next_range() : skip())) continue;
+      const int until = smaller(known_until_, k_ + capacity - count);
       while (k_ < until) k_out[count++] = k_++;
     }
     return count;
@@ -63,40 +117,35 @@ template <class Real> class Lattice {
  private:
   // Smallest k with t_k >= t, held to a range that an int can count.
   SURFCAP_HD int index_after(Real t) const {
-    return int(std::ceil(smaller(t / step_ - offset_, Real(1 << 30))));
+    const Real x = clamped(t * per_step_ - offset_, Real(-1), Real(1 << 30));
+    const int k = int(x);
+    return k + (Real(k) < x);
   }
 
-  // Reads the cell of sample k. In an empty cell jumps to the first sample beyond the empty neighbourhood and returns
-  // its size, in a non-empty one notes how far the cell reaches and returns 0.
-  SURFCAP_HD int look() {
-    const Real t = distance(k_);
-    int cell[3];
-    for (int axis = 0; axis < 3; ++axis) {
-      const int c = int(line_.at(axis, t)) >> 2;
-      const int last = field_.n[axis] - 2;
-      cell[axis] = c < 0 ? 0 : c > last ? last : c;
-    }
-    const int entry = field_.table[(cell[0] * field_.n[1] + cell[1]) * field_.n[2] + cell[2]];
-    const int depth = entry < kOutside ? kOutside - entry : 0;
-    const int reach = depth > 0 ? depth - 1 : 0;
-    Real leave = Real(3.0e38);
-    for (int axis = 0; axis < 3; ++axis) {
-      const int border = line_.direction[axis] > 0 ? cell[axis] + reach + 1 : cell[axis] - reach;
-      const Real t_border = (Real(kTile * border) - line_.origin[axis]) * inverse_[axis];
-      leave = line_.direction[axis] == Real(0) ? leave : smaller(leave, t_border);
-    }
-    int next = index_after(leave);
-    next = next > k_ ? next : k_ + 1;
-    next = next < end_ ? next : end_;
-    (depth > 0 ? k_ : known_until_) = next;
-    if (depth > 0) known_until_ = k_;
-    return depth;
+  // In an empty cell jumps past it and returns true; in another notes how far it reaches and returns false.
+  SURFCAP_HD bool skip() {
+    Real leave;
+    const bool empty = cells_.empty((Real(k_) + offset_) * step_, leave);
+    known_until_ = smaller(larger(index_after(leave), k_ + 1), end_);
+    if (empty) k_ = known_until_;
+    return empty;
   }
 
-  const Field<Real>& field_;
-  const Line<Real>& line_;
-  Real inverse_[3];
-  Real step_, offset_;
+  SURFCAP_HD bool next_range() {
+    if (left_-- == 0) {
+      k_ = end_;
+      return false;
+    }
+    k_ = larger(k_, index_after(ranges_[0]));
+    known_until_ = smaller(index_after(ranges_[1]), end_);
+    ranges_ += 2;
+    return k_ < known_until_;
+  }
+
+  const Cells<Real>& cells_;
+  const Real* ranges_;
+  int32_t left_;
+  Real step_, per_step_, offset_;
   int k_, end_, known_until_;
 };
 

@@ -45,21 +45,21 @@ template <class Real> SURFCAP_HD int64_t trace_capacity(const Field<Real>& field
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD RayResult<Real> walk_forward(const Field<Real>& field, const Real* missing_records, const Line<Real>& line,
                                         const Coefficients<Real, Degree>& weights, const RaySettings<Real>& settings,
-                                        Real shift, const Opacity& opacity, const Trace<Real, Opacity>& trace) {
-  Lattice<Real> lattice(field, line, settings.step, shift);
+                                        Lattice<Real> lattice, const Opacity& opacity,
+                                        const Trace<Real, Opacity>& trace) {
   RayResult<Real> ray{zero_pack<Real, 4>(), Real(1), Real(0), 0};
   typename Opacity::State before = opacity.outside();
   Pack<Real, 4> color_before = zero_pack<Real, 4>();
   int k_before = -2;
   for (bool alive = true; alive;) {
-    int k[kLanes];
+    int32_t k[kLanes];
     const int count = lattice.next(k, kLanes);
     if (count == 0) break;
-    Real t[kLanes], u[3][kLanes];
     for (int l = count; l < kLanes; ++l) k[l] = k[count - 1];
-    for (int l = 0; l < kLanes; ++l) t[l] = lattice.distance(k[l]);
-    for (int axis = 0; axis < 3; ++axis)
-      for (int l = 0; l < kLanes; ++l) u[axis][l] = line.at(axis, t[l]);
+    const Pack<Real, kLanes> t =
+        (convert_pack<Real, kLanes, int32_t>(load<int32_t, kLanes>(k)) + lattice.offset()) * settings.step;
+    Pack<Real, kLanes> u[3];
+    for (int axis = 0; axis < 3; ++axis) u[axis] = line.origin[axis] + t * line.direction[axis];
     Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
     locate(field, u, at);
     for (int l = 0; l < count; ++l) {

@@ -6,6 +6,10 @@
 
 #include "views.h"
 
+#if defined(__x86_64__) && !defined(__CUDACC__)
+#include <immintrin.h>
+#endif
+
 #if defined(__CUDACC__)
 #define SURFCAP_HD __host__ __device__ __forceinline__
 #else
@@ -35,6 +39,11 @@ template <class Real, int N> struct PackStruct {
     for (int i = 0; i < N; ++i) r.lane[i] = a op b.lane[i];                                                            \
     return r;                                                                                                          \
   }                                                                                                                    \
+  friend SURFCAP_HD PackStruct operator op(const PackStruct& a, Real b) {                                              \
+    PackStruct r;                                                                                                      \
+    for (int i = 0; i < N; ++i) r.lane[i] = a.lane[i] op b;                                                            \
+    return r;                                                                                                          \
+  }                                                                                                                    \
   SURFCAP_HD PackStruct& operator op##=(const PackStruct& b) { return *this = *this op b; }
   SURFCAP_PACK_OPERATOR(+)
   SURFCAP_PACK_OPERATOR(-)
@@ -48,11 +57,13 @@ template <class Real, int N> struct PackOf { typedef Real type __attribute__((ve
 
 template <class Real, int N> using Pack = typename PackOf<Real, N>::type;
 
-template <class Real, int N> SURFCAP_HD Pack<Real, N> zero_pack() {
+template <class Real, int N> SURFCAP_HD Pack<Real, N> fill_pack(Real x) {
   Pack<Real, N> p;
-  for (int i = 0; i < N; ++i) p[i] = Real(0);
+  for (int i = 0; i < N; ++i) p[i] = x;
   return p;
 }
+
+template <class Real, int N> SURFCAP_HD Pack<Real, N> zero_pack() { return fill_pack<Real, N>(Real(0)); }
 
 // Unaligned load and store of N consecutive numbers. memcpy of a whole register compiles to one move.
 template <class Real, int N> SURFCAP_HD Pack<Real, N> load(const Real* from) {
@@ -63,6 +74,50 @@ template <class Real, int N> SURFCAP_HD Pack<Real, N> load(const Real* from) {
 
 template <class Real, int N> SURFCAP_HD void store(Real* to, const Pack<Real, N>& p) {
   __builtin_memcpy(to, &p, sizeof(p));
+}
+
+// Lane by lane: truncation to integers, integers to numbers, the lesser and the greater of two packs.
+template <class To, int N, class From> SURFCAP_HD Pack<To, N> convert_pack(const Pack<From, N>& from) {
+#if defined(__CUDACC__)
+  Pack<To, N> to;
+  for (int i = 0; i < N; ++i) to[i] = To(from[i]);
+  return to;
+#else
+  return __builtin_convertvector(from, Pack<To, N>);
+#endif
+}
+
+template <class T, int N> SURFCAP_HD Pack<T, N> smaller_pack(const Pack<T, N>& a, const Pack<T, N>& b) {
+#if defined(__CUDACC__)
+  Pack<T, N> r;
+  for (int i = 0; i < N; ++i) r[i] = a[i] < b[i] ? a[i] : b[i];
+  return r;
+#else
+  return a < b ? a : b;
+#endif
+}
+
+template <class T, int N> SURFCAP_HD Pack<T, N> larger_pack(const Pack<T, N>& a, const Pack<T, N>& b) {
+#if defined(__CUDACC__)
+  Pack<T, N> r;
+  for (int i = 0; i < N; ++i) r[i] = a[i] > b[i] ? a[i] : b[i];
+  return r;
+#else
+  return a > b ? a : b;
+#endif
+}
+
+// table[index] for every lane.
+template <int N> SURFCAP_HD Pack<int32_t, N> look_up(const int32_t* table, const Pack<int32_t, N>& index) {
+#if defined(__AVX512F__)
+  if constexpr (N == 16) return Pack<int32_t, N>(_mm512_i32gather_epi32(__m512i(index), table, 4));
+#endif
+#if defined(__AVX2__)
+  if constexpr (N == 8) return Pack<int32_t, N>(_mm256_i32gather_epi32(table, __m256i(index), 4));
+#endif
+  Pack<int32_t, N> r;
+  for (int i = 0; i < N; ++i) r[i] = table[index[i]];
+  return r;
 }
 
 template <class Real> SURFCAP_HD Real smaller(Real a, Real b) { return a < b ? a : b; }

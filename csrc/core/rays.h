@@ -38,7 +38,11 @@ template <class Real, int Degree, class Opacity> struct Marcher {
   SURFCAP_HD RayResult<Real> forward(const Rays<Real>& rays, int64_t i,
                                      const Coefficients<Real, Degree>& weights) const {
     const Line<Real> line(field, rays.origins + 3 * i, rays.directions + 3 * i);
-    return walk_forward<Real, Degree, Opacity>(field, missing_records, line, weights, settings, rays.shift[i], opacity,
+    const Cells<Real> cells(field, line);
+    const int64_t first = rays.ranges ? rays.range_offsets[i] : 0;
+    const Lattice<Real> lattice(cells, settings.step, rays.shift[i], rays.ranges ? rays.ranges + 2 * first : nullptr,
+                                rays.ranges ? int32_t(rays.range_offsets[i + 1] - first) : 0);
+    return walk_forward<Real, Degree, Opacity>(field, missing_records, line, weights, settings, lattice, opacity,
                                                trace);
   }
 };

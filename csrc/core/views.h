@@ -22,8 +22,10 @@ template <class Real> struct Rays {
   const Real* origins;     // [R, 3] world
   const Real* directions;  // [R, 3] world, unit
   const Real* shift;       // [R] displacement of the lattice in steps
-  const Real* background;  // [R, 3] or null where only visibility is asked for
+  const Real* background;  // [R, 3]
   int64_t count;
+  const int64_t* range_offsets;  // [R + 1] or null: where each ray's ranges begin
+  const Real* ranges;            // [M, 2] or null: stretches of the rays that pass non-empty cells
 };
 
 template <class Real> struct RaySettings {

@@ -13,7 +13,7 @@ void adam_step_typed(const Tensor& voxels, const Tensor& gradient, const Tensor&
   STD_TORCH_CHECK(pitch == 4 || pitch == 16 || pitch == 32,
                   "voxels: expected [tiles, 4, 4, 4, 4 | 16 | 32], got ", shape_of(voxels));
   STD_TORCH_CHECK(t >= 1, "t: expected a step counted from 1, got ", t);
-  const std::initializer_list<int64_t> shape = {voxels.size(0), kTileSide, kTileSide, kTileSide, pitch};
+  const Shape shape = {voxels.size(0), kTileSide, kTileSide, kTileSide, pitch};
   Real *const value = output<Real>("voxels", voxels, shape), *const m = output<Real>("first", first, shape),
               *const v = output<Real>("second", second, shape);
   const Input<Real> g("gradient", gradient, shape);

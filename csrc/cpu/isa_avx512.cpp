@@ -1,6 +1,8 @@
 // The kernels for x86-64 with AVX-512. Standard headers come first: code of theirs must stay
 // fit for every processor.
 #if defined(__x86_64__)
+#include <immintrin.h>
+
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>

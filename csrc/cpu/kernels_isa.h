@@ -90,6 +90,18 @@ void photometric_step(const Field<Real>& field, const Rays<Real>& rays, const Ra
 }
 
 template <class Real>
+void integration_ranges(const Field<Real>& field, const Rays<Real>& rays, int64_t begin, int64_t end, int64_t* counts,
+                        Real* ranges) {
+  for (int64_t i = begin; i < end; ++i) {
+    const Line<Real> line(field, rays.origins + 3 * i, rays.directions + 3 * i);
+    const Cells<Real> cells(field, line);
+    Real* const out = ranges ? ranges + 2 * rays.range_offsets[i] : nullptr;
+    const int count = integration_ranges(cells, Real(1) / field.per_unit, out);
+    if (counts) counts[i] = count;
+  }
+}
+
+template <class Real>
 void visibility(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, int64_t begin,
                 int64_t end, Real* seen) {
   with_marcher(field, settings, [&](const auto& march) {
@@ -102,7 +114,7 @@ template <class Real, class Point, class F>
 void for_points(const Field<Real>& field, int64_t begin, int64_t end, const Point& point, const F& f) {
   for (int64_t first = begin; first < end; first += kLanes) {
     const int count = int(end - first < kLanes ? end - first : kLanes);
-    Real u[3][kLanes];
+    Pack<Real, kLanes> u[3];
     for (int l = 0; l < kLanes; ++l) {
       Real x[3];
       point(first + (l < count ? l : 0), x);
@@ -204,7 +216,7 @@ namespace SURFCAP_ISA {
 template <class Real> const Kernels<Real>& kernels() {
   static constexpr Kernels<Real> table{
       SURFCAP_ISA_NAME,      sample_forward<Real>, sample_backward<Real>,  march_forward<Real>,
-      march_backward<Real>,  photometric_step<Real>, visibility<Real>,     voxel_terms<Real>,
+      march_backward<Real>, photometric_step<Real>, integration_ranges<Real>, visibility<Real>, voxel_terms<Real>,
       adam_step<Real>,       soft_hull<Real>,        upscale<Real>};
   return table;
 }

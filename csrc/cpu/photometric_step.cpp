@@ -11,11 +11,14 @@ template <class Real>
 StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
                                   const Tensor& origins, const Tensor& directions, const Tensor& shift,
                                   const Tensor& background, const Tensor& target, const Tensor& mask,
-                                  const Tensor& weight, int64_t opacity, double slope, double step, double stop,
+                                  const Tensor& weight,
+                                  const std::optional<Tensor>& range_offsets, const std::optional<Tensor>& ranges,
+                                  int64_t opacity, double slope, double step, double stop,
                                   double huber, const std::vector<double>& weights, bool detach_sample,
                                   int64_t groups) {
   const FieldArgument<Real> field(voxels, table, frame);
-  const RaysArgument<Real> rays(origins, directions, shift, background);
+  RaysArgument<Real> rays(origins, directions, shift, background);
+  const RangesArgument<Real> stretches(range_offsets, ranges, rays.view);
   const RaySettings<Real> settings = ray_settings<Real>(opacity, slope, step, stop);
   const int64_t count = rays.view.count;
   const Input<Real> photograph("target", target, {count, 3});
@@ -43,11 +46,12 @@ StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, con
 }
 
 StepResult photometric_step(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins, Tensor directions,
-                            Tensor shift, Tensor background, Tensor target, Tensor mask, Tensor weight, int64_t opacity,
+                            Tensor shift, Tensor background, Tensor target, Tensor mask, Tensor weight,
+                            std::optional<Tensor> range_offsets, std::optional<Tensor> ranges, int64_t opacity,
                             double slope, double step, double stop, double huber, std::vector<double> weights,
                             bool detach_sample, int64_t groups) {
   return SURFCAP_BY_TYPE(voxels, photometric_step_typed, voxels, table, frame, origins, directions, shift, background,
-                         target, mask, weight, opacity, slope, step, stop, huber, weights, detach_sample, groups);
+                         target, mask, weight, range_offsets, ranges, opacity, slope, step, stop, huber, weights, detach_sample, groups);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("photometric_step", TORCH_BOX(&photometric_step)); }

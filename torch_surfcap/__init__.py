@@ -1,0 +1,6 @@
+"""Calibrated photographs in, a detailed coloured triangle mesh out."""
+
+from torch_surfcap.data.cameras import Cameras
+from torch_surfcap.data.capture import Capture, load_capture
+from torch_surfcap.errors import InputError
+from torch_surfcap.field.field import RayOutput, SurfaceField

@@ -1,0 +1,1 @@
+"""The sparse voxel field: its tiles, the module over them, and the visual hull it starts from."""

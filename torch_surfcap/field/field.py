@@ -1,0 +1,252 @@
+"""SurfaceField: the sparse field as an nn.Module that sits in anybody's optimiser and loss."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torch_surfcap import ops
+from torch_surfcap.autograd import March, MarchRays, SampleTiles
+from torch_surfcap.data.files import atomic_write
+from torch_surfcap.errors import InputError
+from torch_surfcap.field.tiles import TileGrid, with_skips
+
+if TYPE_CHECKING:
+    import trimesh
+
+ETA = 0.01  # transparency of the solid
+CLAMP = 4.0  # voxels; a signed distance is known in this band and constant beyond it
+SLOPE = 4.0  # per voxel, of the signed distance's logistic
+LEVEL = {"transparency": 0.81, "distance": 0.0}  # value on the surface
+MISSING = {"transparency": (1.0, ETA), "distance": (CLAMP, -CLAMP)}  # value outside, inside
+FORMAT = 1  # of the .npz file
+
+
+class RayOutput(NamedTuple):
+    """What rays see: color [R, 3], transmittance [R], depth [R] (world units, NaN where a ray meets nothing)."""
+
+    color: Tensor
+    transmittance: Tensor
+    depth: Tensor
+
+
+class SurfaceField(nn.Module):
+    """A sparse voxel field of opacity and colour, rendered by marching rays and meshed by marching cubes.
+
+    Attributes:
+        voxels: the one parameter, [T, 4, 4, 4, 1 + 3 (B + 1)^2]: the opacity value, then SH coefficients, RGB innermost.
+        grid: which tiles there are. table: its table (a buffer). tile_coords: [T, 3] int32, relative to ``origin``.
+        opacity: "transparency" (1 = empty) or "distance" (signed, in voxels, positive outside).
+        sh_degree: 0, 1 or 2.
+
+    >>> grid = torch.ones(8, 8, 8); grid[2:6, 2:6, 2:6] = 0.01
+    >>> field = SurfaceField.from_dense(grid, torch.full((8, 8, 8, 1, 3), 0.5), [0.0, 0.0, 0.0], 1.0)
+    >>> out = field(torch.tensor([[4.0, 4.0, -5.0]]), torch.tensor([[0.0, 0.0, 1.0]]))
+    >>> round(out.color[0, 0].item(), 1)
+    0.5
+    """
+
+    def __init__(self, voxels: Tensor, grid: TileGrid, opacity: str = "transparency") -> None:
+        super().__init__()
+        if opacity not in LEVEL:
+            raise ValueError(f"opacity: expected transparency or distance, got {opacity!r}")
+        expected = (len(grid.coords), ops.TILE, ops.TILE, ops.TILE)
+        if voxels.dim() != 5 or tuple(voxels.shape[:4]) != expected:
+            raise ValueError(f"voxels: expected {[*expected, '*']}, got {list(voxels.shape)}")
+        self.sh_degree = ops.degree_of(voxels.shape[-1])
+        # The memory behind the parameter is padded to a record's pitch, so that no op has to copy it.
+        store = ops.padded(voxels.detach()).contiguous()
+        self.voxels = nn.Parameter(store[..., : ops.coefficients(self.sh_degree)])
+        self.opacity = opacity
+        self.voxel_size = grid.voxel_size
+        self.outside, self.inside = MISSING[opacity]
+        self.level = LEVEL[opacity]
+        self.table: Tensor
+        self.tile_coords: Tensor
+        self.origin: Tensor
+        self.register_buffer("table", grid.table.to(voxels.device), persistent=False)
+        self.register_buffer("tile_coords", grid.coords.to(voxels.device), persistent=False)
+        self.register_buffer("origin", torch.tensor(grid.origin, dtype=torch.float64), persistent=False)
+        self._frame = grid.frame(self.outside, self.inside)
+
+    @classmethod
+    def from_dense(
+        cls,
+        transparency: Tensor,
+        sh: Tensor,
+        origin: Tensor | list[float],
+        voxel_size: float,
+        opacity: str = "transparency",
+    ) -> SurfaceField:
+        """The field of a dense grid; tiles that are constantly outside or inside (whatever their colour) are not stored.
+
+        Args:
+            transparency: [X, Y, Z] opacity values (a signed distance in voxels where ``opacity="distance"``); value
+                (i, j, k) sits at ``origin + (i + 1/2, j + 1/2, k + 1/2) * voxel_size``. Beyond the grid is outside.
+            sh: [X, Y, Z, (B + 1)^2, 3] coefficients, or [X, Y, Z, 3] for degree 0.
+            origin: world position of the grid's low corner. voxel_size: world units.
+        """
+        if sh.shape[:3] != transparency.shape or transparency.dim() != 3 or sh.shape[-1] != 3:
+            raise ValueError(f"sh: expected {[*transparency.shape, '(B + 1)^2', 3]}, got {list(sh.shape)}")
+        outside, inside = MISSING[opacity]
+        records = torch.cat([transparency[..., None], sh.flatten(3).to(transparency)], -1)
+        pad = [(-n) % ops.TILE for n in transparency.shape]
+        records = nn.functional.pad(records, (0, 0, 0, pad[2], 0, pad[1], 0, pad[0]))
+        for axis in range(3):  # what was padded is outside
+            records.narrow(axis, transparency.shape[axis], pad[axis])[..., 0] = outside
+        x, y, z = (n // ops.TILE for n in records.shape[:3])
+        tiles = records.reshape(x, 4, y, 4, z, 4, -1).permute(0, 2, 4, 1, 3, 5, 6)
+        value = tiles[..., 0].flatten(3)
+        stored = ~((value == outside).all(-1) | (value <= inside).all(-1))
+        corner = [float(c) for c in origin]
+        grid = TileGrid.build(stored, (value <= inside).all(-1), (corner[0], corner[1], corner[2]), voxel_size)
+        i, j, k = grid.coords.long().unbind(1)
+        return cls(tiles[i, j, k], grid, opacity)
+
+    @property
+    def grid(self) -> TileGrid:
+        x, y, z = self.origin.tolist()
+        return TileGrid(self.table, self.tile_coords, (x, y, z), self.voxel_size)
+
+    @property
+    def frame(self) -> list[float]:
+        """The ``frame`` argument of the ops."""
+        return self._frame
+
+    @property
+    def transparency(self) -> Tensor:
+        """[T, 4, 4, 4] view of the opacity values."""
+        return self.voxels[..., 0]
+
+    @property
+    def sh(self) -> Tensor:
+        """[T, 4, 4, 4, (B + 1)^2, 3] view of the SH coefficients."""
+        return self.voxels[..., 1:].unflatten(-1, ((self.sh_degree + 1) ** 2, 3))
+
+    def march(self, step: float | None = None, stop: float | None = None) -> March:
+        """How rays are sampled: a voxel's diagonal apart; single precision stops at a transmittance of 1e-4."""
+        if step is None:
+            step = math.sqrt(3.0) * self.voxel_size
+        if stop is None:
+            stop = 0.0 if self.voxels.dtype == torch.float64 else 1e-4
+        return March(ops.OPACITY[self.opacity], SLOPE, step, stop)
+
+    def forward(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        background: Tensor | None = None,
+        shift: Tensor | None = None,
+        step: float | None = None,
+    ) -> RayOutput:
+        """The ray integral (paper eq. 6).
+
+        Args:
+            origins, directions: [R, 3], world; directions are unit vectors. background: [R, 3], black by default.
+            shift: [R] displacement of a ray's samples in steps. step: between samples, world units; a voxel's diagonal.
+
+        Differentiability: voxels and background.
+        """
+        dtype, device = self.voxels.dtype, self.voxels.device
+        origins, directions = origins.to(device, dtype), directions.to(device, dtype)
+        if background is None:
+            background = torch.zeros_like(origins)
+        if shift is None:
+            shift = origins.new_zeros(len(origins))
+        store = self._store()
+        rays = (origins, directions, shift.to(device, dtype))
+        color, transmittance, depth = MarchRays.apply(
+            store, background.to(device, dtype), self.table, self._frame, *rays, self.march(step)
+        )
+        return RayOutput(color, transmittance, depth)
+
+    def sample_opacity(self, points: Tensor) -> Tensor:
+        """The raw opacity value at ``points [P, 3]``: [P], differentiable."""
+        return self._read(points)[:, 0]
+
+    def sample(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Transparency [P] and colour [P, 3] at ``points [P, 3]`` seen along unit ``directions [P, 3]``.
+
+        The transparency of a signed distance s is that of a long step that ends there, 1/(1 + exp(-slope s)) turned
+        round: 1 outside, 0 inside. Differentiability: voxels.
+        """
+        values = self._read(points)
+        opacity = values[:, 0]
+        if self.opacity == "distance":
+            opacity = torch.sigmoid(SLOPE * opacity)
+        count = (self.sh_degree + 1) ** 2
+        weights = sh_basis(directions.to(values), self.sh_degree)
+        sh = values[:, 1 : 1 + 3 * count].unflatten(-1, (count, 3))
+        return opacity, (weights[:, :, None] * sh).sum(1)
+
+    def _read(self, points: Tensor) -> Tensor:
+        points = points.to(self.voxels.device, self.voxels.dtype)
+        values: Tensor = SampleTiles.apply(self._store(), self.table, self._frame, points)
+        return values
+
+    def _store(self) -> Tensor:
+        """The parameter as the ops want it: padded records. The memory behind it, where that still is padded."""
+        voxels, width = self.voxels, ops.pitch(self.sh_degree)
+        strides = (64 * width, 16 * width, 4 * width, width, 1)
+        if voxels.shape[-1] < width and voxels.stride() == strides and not (voxels.requires_grad and torch.is_grad_enabled()):
+            return voxels.detach().as_strided((*voxels.shape[:4], width), strides)
+        return ops.padded(voxels)
+
+    def extract_mesh(
+        self, threshold: float | None = None, smooth: int = 0, specks: float = 0.01
+    ) -> trimesh.Trimesh:
+        """The surface by marching cubes, with vertex colours, in world units, normals outward.
+
+        Args:
+            threshold: value on the surface; 0.81 for a transparency, 0 for a signed distance by default.
+            smooth: rounds of Taubin smoothing. specks: pieces under this fraction of the largest one's area are removed.
+        """
+        from torch_surfcap.surface.extract import extract_mesh
+
+        return extract_mesh(self, threshold, smooth=smooth, specks=specks)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an .npz file (complete or absent, no pickle)."""
+        data = {
+            "format": np.int64(FORMAT),
+            "voxels": self.voxels.detach().cpu().numpy(),
+            "table": torch.clamp(self.table, min=ops.OUTSIDE).cpu().numpy(),
+            "tile_coords": self.tile_coords.cpu().numpy(),
+            "origin": self.origin.cpu().numpy(),
+            "voxel_size": np.float64(self.voxel_size),
+            "opacity": np.str_(self.opacity),
+        }
+        with atomic_write(path) as partial, open(partial, "wb") as file:
+            np.savez(file, **data)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SurfaceField:
+        """The field of a file that :meth:`save` wrote. Raises InputError if it is none."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                if int(data["format"]) != FORMAT:
+                    raise InputError(f"{path}: field format {int(data['format'])}, expected {FORMAT}")
+                x, y, z = (float(c) for c in data["origin"])
+                table, coords = torch.from_numpy(data["table"]), torch.from_numpy(data["tile_coords"])
+                grid = TileGrid(with_skips(table), coords, (x, y, z), float(data["voxel_size"]))
+                return cls(torch.from_numpy(data["voxels"]), grid, str(data["opacity"]))
+        except (OSError, KeyError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}: not a saved field ({error}), expected an .npz file of SurfaceField.save") from error
+
+
+def sh_basis(directions: Tensor, sh_degree: int) -> Tensor:
+    """The basis 1, y, z, x, xy, yz, (3 z^2 - 1)/2, xz, (x^2 - y^2)/2 at unit directions [P, 3]: [P, (B + 1)^2]."""
+    x, y, z = directions.unbind(-1)
+    basis = [torch.ones_like(x)]
+    if sh_degree >= 1:
+        basis += [y, z, x]
+    if sh_degree >= 2:
+        basis += [x * y, y * z, 0.5 * (3 * z * z - 1), x * z, 0.5 * (x * x - y * y)]
+    return torch.stack(basis, -1)

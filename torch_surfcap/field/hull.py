@@ -1,0 +1,155 @@
+"""The soft visual hull: where the subject can be, by its silhouettes alone.
+
+At a point it is the least of the bilinearly read masks of the cameras that see the point, so its level 1/2 is the
+classic visual hull with subpixel borders. Space that too few cameras see is outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torch_surfcap import ops
+from torch_surfcap.data.cameras import Cameras
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.errors import InputError
+
+CHUNK = 1 << 20  # points a call, to bound the memory
+BOX_CELLS = 64  # along the longest side of the search for the box
+BOX_ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """The masks of a capture, laid end to end with their cameras, as the op wants them.
+
+    projections: [V, 3, 4] float64; masks: flat float32; sizes: [V, 2] int64; quorum: cameras that must see a point.
+    """
+
+    projections: Tensor
+    masks: Tensor
+    sizes: Tensor
+    quorum: int
+
+    @staticmethod
+    def of(capture: Capture, grow: int = 0) -> Silhouettes:
+        """The silhouettes of a capture, each grown by ``grow`` pixels (maximum over a square)."""
+        if capture.masks is None:
+            raise InputError("capture: no masks, expected silhouettes (Capture.masks) for the visual hull")
+        return Silhouettes.of_masks([grown(mask, grow) for mask in capture.masks], capture.cameras)
+
+    @staticmethod
+    def of_masks(masks: list[Tensor], cameras: Cameras) -> Silhouettes:
+        quorum = min(len(masks), max(2, len(masks) // 10))
+        flat = torch.cat([mask.flatten() for mask in masks])
+        return Silhouettes(cameras.projection_matrices(), flat, cameras.size, quorum)
+
+    def hull(self, points: Tensor) -> Tensor:
+        """Hull value at world points [..., 3]: float32 in [0, 1], 0 where fewer than ``quorum`` cameras look."""
+        flat = points.reshape(-1, 3)
+        # Shifting the world to the points' middle keeps single precision exact to far below a pixel.
+        center = flat.double().mean(0) if len(flat) else torch.zeros(3, dtype=torch.float64)
+        shifted = self.projections.clone()
+        shifted[:, :, 3] += self.projections[:, :, :3] @ center
+        values = []
+        for chunk in flat.split(CHUNK):
+            local = (chunk.double() - center).float()
+            value, votes = ops.soft_hull(local, shifted.float(), self.masks, self.sizes)
+            values.append(torch.where(votes >= self.quorum, value, 0.0))
+        return torch.cat(values).reshape(points.shape[:-1]) if values else points.new_zeros(points.shape[:-1])
+
+
+def grown(mask: Tensor, pixels: int) -> Tensor:
+    """Maximum of a mask [H, W] over squares that reach ``pixels`` far."""
+    if pixels <= 0:
+        return mask
+    side = 2 * pixels + 1
+    return torch.nn.functional.max_pool2d(mask[None, None], side, stride=1, padding=pixels)[0, 0]
+
+
+def find_box(capture: Capture) -> tuple[Tensor, Tensor]:
+    """The subject's box by silhouettes and cameras: (low [3], high [3]) float64, a few percent larger than the hull.
+
+    A cube around the point nearest to all central rays is sampled with masks that are widened to the sampling, and
+    shrunk to what is occupied until it stays put.
+
+    Raises InputError if no region is seen by enough cameras, or if the silhouettes have no common volume.
+    """
+    assert capture.masks is not None
+    center, radius = _first_guess(capture)
+    low, high = center - radius, center + radius
+    volume = torch.prod(high - low)
+    for _ in range(BOX_ROUNDS):
+        cell = float((high - low).max()) / BOX_CELLS
+        points, spacing = _lattice(low, high, cell)
+        reach = _pixels_per_unit(capture.cameras, (low + high) / 2) * cell / 2
+        occupied = points[_widened(capture, reach).hull(points) > 0.5]
+        if len(occupied) == 0:
+            raise InputError(
+                "silhouettes: their cones have no common volume, expected masks of one subject and world-to-camera poses "
+                "with OpenCV axes (train/check.py tries the usual conventions)"
+            )
+        low, high = occupied.amin(0) - spacing, occupied.amax(0) + spacing
+        smaller = torch.prod(high - low)
+        if smaller > 0.9 * volume:
+            break
+        volume = smaller
+    return low, high
+
+
+def _first_guess(capture: Capture) -> tuple[Tensor, float]:
+    """A cube that holds the hull: the point nearest to the rays through the masks' centres, and how far the subject
+    reaches around it as the cameras see it."""
+    cameras = capture.cameras
+    normal, moment = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    extents = []
+    assert capture.masks is not None
+    for i, mask in enumerate(capture.masks):
+        v, u = (mask > 0.5).nonzero().double().unbind(1)
+        if len(u) == 0:
+            raise InputError(f"mask of camera {capture.names[i]}: empty, expected a silhouette")
+        middle = torch.stack([u.mean() + 0.5, v.mean() + 0.5])
+        origin, direction = cameras.rays(i, middle[None])
+        projector = torch.eye(3, dtype=torch.float64) - direction[0, :, None] * direction[0]
+        normal += projector
+        moment += projector @ origin[0]
+        corners = torch.tensor([[u.min(), v.min()], [u.max(), v.min()], [u.min(), v.max()], [u.max(), v.max()]])
+        _, directions = cameras.rays(i, corners.double() + 0.5)
+        cosine = (directions @ direction[0]).amin().clamp(0.1, 1.0)
+        extents.append(float(torch.sqrt(1 / cosine**2 - 1)))
+    center = torch.linalg.lstsq(normal, moment).solution
+    distance = (center - cameras.centers).norm(dim=1)
+    return center, 2.0 * float((distance * torch.tensor(extents, dtype=torch.float64)).median())
+
+
+def _lattice(low: Tensor, high: Tensor, cell: float) -> tuple[Tensor, Tensor]:
+    """Cell centres [X, Y, Z, 3] of a box, and the cells' extent [3]."""
+    counts = torch.ceil((high - low) / cell - 1e-6).clamp(min=1).long()
+    spacing = (high - low) / counts
+    axes = [low[a] + (torch.arange(int(counts[a]), dtype=torch.float64) + 0.5) * spacing[a] for a in range(3)]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1), spacing
+
+
+def _pixels_per_unit(cameras: Cameras, point: Tensor) -> Tensor:
+    """[V] pixels that a world unit covers at a point."""
+    focal = (cameras.K[:, 0, 0] + cameras.K[:, 1, 1]) / 2
+    return focal / (cameras.centers - point).norm(dim=1).clamp(min=1e-12)
+
+
+def _widened(capture: Capture, reach: Tensor) -> Silhouettes:
+    """Silhouettes grown by a cell's ``reach`` [V] in pixels, so that no thin part is lost between the cells; at half the
+    size as long as the reach is over four pixels."""
+    masks, cameras = capture.masks, capture.cameras
+    assert masks is not None
+    while float(reach.median()) > 4.0 and int(cameras.size.min()) > 8:
+        masks = [torch.nn.functional.max_pool2d(mask[None, None], 2)[0, 0] for mask in masks]
+        cameras, reach = cameras.scaled_half(), reach / 2
+    pixels = torch.ceil(reach).long() + 1
+    return Silhouettes.of_masks([grown(mask, int(p)) for mask, p in zip(masks, pixels, strict=True)], cameras)
+
+
+def pixel_footprint(cameras: Cameras, point: Tensor) -> float:
+    """World size of a pixel at a point, the median over the cameras."""
+    return float((1.0 / _pixels_per_unit(cameras, point)).median())

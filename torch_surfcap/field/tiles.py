@@ -1,0 +1,127 @@
+"""Which tiles a sparse field has: the table that maps a place to a tile, to inside, or to outside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import distance_transform_cdt
+from torch import Tensor
+
+from torch_surfcap.ops import INSIDE, OUTSIDE, TILE
+
+MAX_SKIP = 120  # cells; farther empty space is crossed in several strides
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """Tiles of 4x4x4 voxels in a box.
+
+    table:      [X+2, Y+2, Z+2] int32, tile index, ``INSIDE`` or ``OUTSIDE - d`` (see :mod:`torch_surfcap.ops`); the
+                outermost layer is a border of outside tiles
+    coords:     [T, 3] int32, place of each stored tile relative to ``origin`` (border not counted), in Morton order
+    origin:     world position of the low corner of tile (0, 0, 0)
+    voxel_size: world units
+    """
+
+    table: Tensor
+    coords: Tensor
+    origin: tuple[float, float, float]
+    voxel_size: float
+
+    @staticmethod
+    def build(stored: Tensor, inside: Tensor, origin: tuple[float, float, float], voxel_size: float) -> TileGrid:
+        """The grid of the tiles marked in ``stored [X, Y, Z]`` bool; of the others those in ``inside`` are inside."""
+        coords = morton_sorted(stored.nonzero().to(torch.int32))
+        table = torch.full([n + 2 for n in stored.shape], OUTSIDE, dtype=torch.int32, device=stored.device)
+        table[1:-1, 1:-1, 1:-1][inside & ~stored] = INSIDE
+        x, y, z = (coords.long() + 1).unbind(1)
+        table[x, y, z] = torch.arange(len(coords), dtype=torch.int32, device=stored.device)
+        return TileGrid(with_skips(table), coords, origin, float(voxel_size))
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Extent in tiles, border not counted."""
+        x, y, z = self.table.shape
+        return x - 2, y - 2, z - 2
+
+    @property
+    def places(self) -> Tensor:
+        """[T, 3] int32, where each tile stands in the table."""
+        return self.coords + 1
+
+    @property
+    def inside(self) -> Tensor:
+        """[X, Y, Z] bool: missing tiles that are inside."""
+        return self.table[1:-1, 1:-1, 1:-1] == INSIDE
+
+    def frame(self, outside: float, inside: float) -> list[float]:
+        """The ``frame`` argument of the ops."""
+        edge = TILE * self.voxel_size
+        return [*(o - edge for o in self.origin), self.voxel_size, outside, inside]
+
+    def to(self, device: torch.device | str) -> TileGrid:
+        return TileGrid(self.table.to(device), self.coords.to(device), self.origin, self.voxel_size)
+
+    def refined(self, surface: Tensor, solid: Tensor) -> TileGrid:
+        """The grid of half the voxel size that follows a surface.
+
+        A fine tile is stored if a surface voxel lies in it or, with a margin of one coarse voxel (26 neighbours), beside
+        it; else it is inside if more than half of the 8 coarse voxels under it are solid, or if it lies in a missing tile
+        that is inside.
+
+        Args:
+            surface, solid: [T, 4, 4, 4] bool, per stored voxel of this grid.
+        """
+        fine_size = torch.tensor([2 * n for n in self.size], device=surface.device)
+        stored = torch.zeros([2 * n for n in self.size], dtype=torch.bool, device=surface.device)
+        tile, x, y, z = surface.nonzero().unbind(1)
+        voxel = self.coords.long()[tile] * TILE + torch.stack([x, y, z], 1)
+        for corner in range(27):
+            offset = torch.tensor([corner // 9 - 1, corner // 3 % 3 - 1, corner % 3 - 1], device=surface.device)
+            fine = torch.div(voxel + offset, 2, rounding_mode="floor")
+            fine = fine[((fine >= 0) & (fine < fine_size)).all(1)]
+            stored[fine[:, 0], fine[:, 1], fine[:, 2]] = True
+        inside = self.inside.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+        halves = solid.reshape(-1, 2, 2, 2, 2, 2, 2).float().mean((2, 4, 6)) > 0.5  # [T, 2, 2, 2] fine tiles
+        half = torch.tensor([[i // 4, i // 2 % 2, i % 2] for i in range(8)], device=surface.device)
+        place = (self.coords.long()[:, None] * 2 + half).reshape(-1, 3)
+        inside[place[:, 0], place[:, 1], place[:, 2]] = halves.reshape(-1)
+        return TileGrid.build(stored, inside, self.origin, self.voxel_size / 2)
+
+
+def voxel_centers(grid: TileGrid, tiles: slice = slice(None)) -> Tensor:
+    """[T, 4, 4, 4, 3] float64 world positions of the voxels of the stored tiles."""
+    steps = torch.arange(TILE, dtype=torch.float64, device=grid.coords.device) + 0.5
+    inner = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    low = grid.coords[tiles].double()[:, None, None, None] * TILE
+    return torch.tensor(grid.origin, dtype=torch.float64, device=low.device) + (low + inner) * grid.voxel_size
+
+
+def with_skips(table: Tensor) -> Tensor:
+    """``table`` with every outside entry turned into OUTSIDE - d, d the distance in cells (Chebyshev) to the nearest
+    cell that is not empty, so that the march can leave empty space in long strides. Values mean the same."""
+    occupied = (table > OUTSIDE).cpu().numpy()
+    cell = occupied.copy()  # a cell is empty if the tiles t .. t + 1 are outside
+    for axis in range(3):
+        upper = np.zeros_like(cell)
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        upper[tuple(low)] = cell[tuple(high)]
+        cell |= upper
+    if cell.any():
+        distance = distance_transform_cdt(~cell, metric="chessboard")
+    else:
+        distance = np.full(cell.shape, MAX_SKIP)
+    skips = torch.from_numpy(np.minimum(distance, MAX_SKIP).astype(np.int32)).to(table.device)
+    return torch.where(table > OUTSIDE, table, OUTSIDE - skips)
+
+
+def morton_sorted(coords: Tensor) -> Tensor:
+    """Places [T, 3] in Morton order (bits of x, y and z interleaved), so that neighbours lie close in memory."""
+    key = torch.zeros(len(coords), dtype=torch.int64, device=coords.device)
+    for bit in range(20):
+        for axis in range(3):
+            key |= ((coords[:, axis].long() >> bit) & 1) << (3 * bit + 2 - axis)
+    return coords[key.argsort()]
