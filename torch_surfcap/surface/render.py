@@ -147,6 +147,19 @@ def mesh_normals(mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Ba
     return hits.picture(0.5 + 0.5 * normals, backdrop(background, hits.size))
 
 
+def colored(mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background = 1.0) -> Tensor:
+    """[H, W, 3]: the mesh's own vertex colours, interpolated within the faces, under a lamp at the camera."""
+    if not isinstance(mesh.visual, trimesh.visual.ColorVisuals):
+        raise ValueError("a mesh with vertex colours is needed")
+    hits = cast(mesh, cameras, i)
+    faces = np.asarray(mesh.faces)[hits.face]
+    weights = trimesh.triangles.points_to_barycentric(np.asarray(mesh.vertices)[faces], hits.point)
+    colors = np.asarray(mesh.visual.vertex_colors)[faces, :3] / 255.0
+    light = np.abs(row_dot(_normals(mesh, hits), hits.direction))
+    values = (0.4 + 0.6 * light)[:, None] * np.einsum("ij,ijk->ik", weights, colors)
+    return hits.picture(torch.from_numpy(values), backdrop(background, hits.size))
+
+
 def _normals(mesh: trimesh.Trimesh, hits: Hits) -> Array:
     return face_normals(np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)[hits.face]])
 

@@ -1,0 +1,224 @@
+"""What a run leaves behind: scores of its views, pictures to look at, tables. Every file is complete or absent."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torch_surfcap.data.cameras import Cameras
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.files import atomic_write
+from torch_surfcap.metrics import psnr, ssim
+from torch_surfcap.surface.render import colored, mesh_mask, raster, shaded, volume
+
+if TYPE_CHECKING:
+    from torch_surfcap.field.field import SurfaceField
+
+Path = str | os.PathLike[str]
+
+CELL = 420  # largest height of a picture in a preview, pixels
+SCORED = 8  # views scored during a fit; evaluate.py scores all
+PREVIEWED = 4
+COLUMNS = ("photograph", "volume", "raster", "geometry")
+BEYOND = np.array([40, 170, 60, 255], dtype=np.uint8)  # green: farther from the truth than counts
+ERRORS = "Reds"  # colour map of the errors, without any green
+
+
+def some_views(count: int, most: int) -> list[int]:
+    """At most `most` of `count` views, evenly spread."""
+    return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most)).round()}) if count else []
+
+
+def scene_background(capture: Capture, i: int, background: float | Sequence[float] = 1.0) -> Tensor:
+    """[H, W, 3]: what is behind the subject in view i where it is scored: the plate, else the constant colour."""
+    if capture.plates is not None:
+        return capture.plate(i)
+    width, height = (int(s) for s in capture.cameras.size[i])
+    return torch.as_tensor(background, dtype=torch.float32).expand(height, width, 3)
+
+
+def scene_photograph(capture: Capture, i: int, background: float | Sequence[float] = 1.0) -> Tensor:
+    """[H, W, 3]: the photograph that a rendering of view i is held against: as it is where a plate shows the room,
+    else composited with its soft mask over the constant colour."""
+    photograph = capture.photograph(i)
+    if capture.plates is not None or capture.masks is None:
+        return photograph
+    mask = capture.masks[i][:, :, None]
+    return mask * photograph + (1 - mask) * scene_background(capture, i, background)
+
+
+def score_view(
+    field: SurfaceField,
+    mesh: trimesh.Trimesh,
+    capture: Capture,
+    i: int,
+    background: float | Sequence[float] = 1.0,
+) -> dict[str, float]:
+    """Scores of one view: psnr_volume, psnr_raster, ssim (volume) over the full frame; psnr_masked,
+    psnr_raster_masked where the mask is over 0.5; silhouette_iou of the mesh against that mask."""
+    truth, behind = scene_photograph(capture, i, background), scene_background(capture, i, background)
+    through = volume(field, capture.cameras, i, behind)
+    onto = raster(field, mesh, capture.cameras, i, behind)
+    scores = {
+        "psnr_volume": psnr(through, truth),
+        "psnr_raster": psnr(onto, truth),
+        "ssim": ssim(through, truth),
+    }
+    if capture.masks is not None:
+        mask = capture.masks[i] > 0.5
+        scores["psnr_masked"] = psnr(through, truth, mask)
+        scores["psnr_raster_masked"] = psnr(onto, truth, mask)
+        covered = mesh_mask(mesh, capture.cameras, i) > 0.5
+        scores["silhouette_iou"] = float((mask & covered).sum() / (mask | covered).sum().clamp(min=1))
+    return scores
+
+
+def score_views(
+    field: SurfaceField,
+    mesh: trimesh.Trimesh,
+    capture: Capture,
+    views: Iterable[int] | None = None,
+    background: float | Sequence[float] = 1.0,
+) -> dict[str, float]:
+    """Means over views (all if None) of `score_view`, and their number as "views"."""
+    each = [
+        score_view(field, mesh, capture, i, background)
+        for i in (range(len(capture)) if views is None else views)
+    ]
+    return mean_scores(each)
+
+
+def mean_scores(each: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Mean of every score over views (those where it is a number), and "views"."""
+    means: dict[str, float] = {}
+    for name in each[0] if each else ():
+        values = [scores[name] for scores in each if not math.isnan(scores[name])]
+        means[name] = float(np.mean(values)) if values else math.nan
+    return {**means, "views": len(each)}
+
+
+def write_preview(
+    path: Path,
+    field: SurfaceField,
+    mesh: trimesh.Trimesh,
+    capture: Capture,
+    views: Sequence[int] | None = None,
+    background: float | Sequence[float] = 1.0,
+) -> None:
+    """PNG with a row per view (a few spread ones if None): photograph, volume, raster, shaded geometry."""
+    rows = []
+    for i in some_views(len(capture), PREVIEWED) if views is None else views:
+        behind = scene_background(capture, i, background)
+        pictures = [
+            scene_photograph(capture, i, background),
+            volume(field, capture.cameras, i, behind),
+            raster(field, mesh, capture.cameras, i, behind),
+            shaded(mesh, capture.cameras, i),
+        ]
+        rows.append(np.concatenate([_cell(p) for p in pictures], axis=1))
+    width = max(row.shape[1] for row in rows)
+    head = np.full((24, rows[0].shape[1], 3), 255, dtype=np.uint8)
+    for j, name in enumerate(COLUMNS):
+        at = (6 + j * head.shape[1] // len(COLUMNS), 17)
+        cv2.putText(head, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    padded = [
+        np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=1)
+        for r in [head / np.float32(255), *rows]
+    ]
+    write_picture(path, torch.from_numpy(np.concatenate(padded)))
+
+
+def _cell(picture: Tensor) -> NDArray[np.float32]:
+    """A picture [H, W, 3] made small enough for a preview."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, CELL / height)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return np.asarray(cv2.resize(picture.numpy(), size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def write_picture(path: Path, picture: Tensor) -> None:
+    """8-bit PNG of [H, W, 3] in [0, 1] (clipped)."""
+    pixels = np.rint(picture.clamp(0, 1).numpy() * 255).astype(np.uint8)
+    encoded = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1]
+    with atomic_write(path) as partial:
+        partial.write_bytes(encoded.tobytes())
+
+
+def write_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
+    """PLY, GLB, OBJ or what else the suffix says and trimesh writes."""
+    with atomic_write(path) as partial:
+        mesh.export(str(partial))
+
+
+def write_history(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """CSV with a line per iteration; columns in the order in which they first appear."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with atomic_write(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """JSON; what is no finite number becomes null, since JSON has no NaN."""
+    with atomic_write(path) as partial:
+        partial.write_text(json.dumps(_plain(values), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """The value in types that JSON knows."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry) for name, entry in value.items()}
+    if isinstance(value, Tensor | np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def error_mesh(mesh: trimesh.Trimesh, distance: NDArray[np.float64], top: float) -> trimesh.Trimesh:
+    """The mesh with its vertices' distances [V] to the truth as colours: white 0, dark red `top` and more (world
+    units), green where infinite, which stands for beyond the cut."""
+    import matplotlib  # half a second that a fit need not wait for
+
+    shades = matplotlib.colormaps[ERRORS](
+        np.clip(np.nan_to_num(distance, posinf=top) / top, 0, 1), bytes=True
+    )
+    colors = np.where(np.isfinite(distance)[:, None], shades, BEYOND)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
+
+
+def write_errors(
+    path: Path, mesh: trimesh.Trimesh, cameras: Cameras, views: Sequence[int], top: float
+) -> None:
+    """PNG of a mesh of `error_mesh` from some cameras, with its scale."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.2 * len(views) + 1.2, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(views), squeeze=False)[0]
+    for axis, i in zip(axes, views, strict=True):
+        axis.imshow(colored(mesh, cameras, i).clamp(0, 1).numpy())
+        axis.set_axis_off()
+    scale = ScalarMappable(Normalize(0, top), ERRORS)
+    figure.colorbar(
+        scale, ax=list(axes), label="distance to the true surface (green: beyond the cut)", extend="max"
+    )
+    with atomic_write(path) as partial:
+        figure.savefig(partial, dpi=110)
