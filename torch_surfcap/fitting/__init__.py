@@ -1,0 +1,1 @@
+"""The fit: full gradient descent over levels, coarse to fine."""

@@ -1,0 +1,127 @@
+"""The levels of a fit: their plan, the first field out of the hull, and the change to the next level."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from scipy.ndimage import binary_dilation, distance_transform_edt
+from torch import Tensor
+
+from torch_surfcap import ops
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.errors import InputError
+from torch_surfcap.field.field import CLAMP, MISSING, SLOPE
+from torch_surfcap.field.hull import Silhouettes, find_box, pixel_footprint
+from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.rays import RayBatch
+
+ITERATIONS = (60, 40, 30, 20)  # from the fourth-finest level to the finest: a scale, not a limit
+SMALLEST_IMAGE = 32  # pixels along the shorter side of the coarsest pictures
+MARGIN = 2  # coarse voxels around the subject's box
+FOG = 0.98  # transparency that the hull is filled with
+BAND = 1.5  # voxels on either side of a signed distance's zero that the next level follows
+SEEN = 0.02  # largest weight above which a voxel belongs to the surface; largest transmittance under which it is solid
+
+
+@dataclass(frozen=True)
+class Level:
+    """voxel_size in world units; halvings of the pictures; iterations that recipe-like scenes take."""
+
+    voxel_size: float
+    halvings: int
+    iterations: int
+
+
+def plan_levels(capture: Capture, box: tuple[Tensor, Tensor], voxel: float | None, levels: int | None) -> list[Level]:
+    """From coarse to fine: voxels halve and pictures double until they have their full size.
+
+    The finest voxel is by default a pixel's footprint at the box's middle (the median over the cameras).
+    """
+    finest = voxel if voxel is not None else pixel_footprint(capture.cameras, (box[0] + box[1]) / 2)
+    side = int(capture.cameras.size.min())
+    if levels is None:
+        levels = 1
+        while levels < len(ITERATIONS) and side >> levels >= SMALLEST_IMAGE:
+            levels += 1
+    plan = []
+    for index in range(levels):
+        behind = levels - 1 - index
+        halvings = min(behind, max(0, side.bit_length() - 3))
+        plan.append(Level(finest * 2**behind, halvings, ITERATIONS[max(0, len(ITERATIONS) - 1 - behind)]))
+    return plan
+
+
+def subject_box(capture: Capture, box: tuple[float, ...] | None) -> tuple[Tensor, Tensor]:
+    """(low [3], high [3]) float64: as given, else found from silhouettes and cameras."""
+    if box is None:
+        return find_box(capture)
+    if len(box) != 6 or not all(a < b for a, b in zip(box[:3], box[3:], strict=True)):
+        raise InputError(f"box: found {list(box)}, expected x0, y0, z0, x1, y1, z1 with low < high")
+    return torch.tensor(box[:3], dtype=torch.float64), torch.tensor(box[3:], dtype=torch.float64)
+
+
+def first_field(
+    capture: Capture, box: tuple[Tensor, Tensor], voxel_size: float, opacity: str, sh_degree: int
+) -> tuple[TileGrid, Tensor]:
+    """Grid and padded records [T, 4, 4, 4, P] of the coarsest level, out of the soft hull.
+
+    The hull of masks grown by a pixel is widened by a voxel, so that no thin part is lost on the coarse grid. A signed
+    distance starts as the distance to it, a transparency as thin fog inside it; both grey.
+    """
+    low, high = box
+    edge = ops.TILE * voxel_size
+    corner = low - MARGIN * voxel_size
+    size = [int(n) for n in torch.ceil((high - low + 2 * MARGIN * voxel_size) / edge)]
+    x, y, z = corner.tolist()
+    steps = [(torch.arange(n * ops.TILE, dtype=torch.float64) + 0.5) * voxel_size for n in size]
+    points = torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + corner
+    hull = binary_dilation((Silhouettes.of(capture, grow=1).hull(points) > 0.5).numpy())
+    if not hull.any():
+        raise InputError("silhouettes: the visual hull is empty inside the box, expected a subject there")
+    distance = torch.from_numpy(distance_transform_edt(~hull) - distance_transform_edt(hull)).float()
+    distance = distance - torch.sign(distance) * 0.5  # of voxel centres to the border between voxels
+    outside, inside = MISSING[opacity]
+    if opacity == "distance":
+        value = (distance - 0.5).clamp(-CLAMP, CLAMP)
+        stored, deep = _tilewise(distance < 2.0), ~_tilewise(distance > -CLAMP)
+    else:
+        value = torch.where(distance < 0, FOG, outside)
+        stored, deep = _tilewise(distance < 1.0), torch.zeros(size, dtype=torch.bool)
+    grid = TileGrid.build(stored & ~deep, deep, (x, y, z), voxel_size)
+    tiles = value.reshape(size[0], 4, size[1], 4, size[2], 4).permute(0, 2, 4, 1, 3, 5)
+    i, j, k = grid.coords.long().unbind(1)
+    store = torch.zeros(len(grid.coords), 4, 4, 4, ops.pitch(sh_degree))
+    store[..., 0] = tiles[i, j, k]
+    store[..., 1:4] = 0.5
+    return grid, store
+
+
+def _tilewise(voxels: Tensor) -> Tensor:
+    """Whether any voxel of a tile is marked: [4X, 4Y, 4Z] -> [X, Y, Z]."""
+    pooled = torch.nn.functional.max_pool3d(voxels.float()[None, None], ops.TILE)
+    return pooled[0, 0] > 0
+
+
+def next_level(
+    grid: TileGrid, store: Tensor, opacity: str, rays: RayBatch, step: float, stop: float
+) -> tuple[TileGrid, Tensor]:
+    """Grid and records at half the voxel size.
+
+    A signed distance knows where its surface is. A transparency does not: its surface is where samples have weight,
+    and what no camera's light reaches is solid (paper, section 4.2).
+    """
+    outside, inside = MISSING[opacity]
+    frame = grid.frame(outside, inside)
+    if opacity == "distance":
+        surface, solid = store[..., 0].abs() < BAND, store[..., 0] < 0
+    else:
+        shift = torch.zeros_like(rays.mask)
+        march = (ops.OPACITY[opacity], SLOPE, step, stop)
+        seen = ops.visibility(store, grid.table, frame, rays.origins, rays.directions, shift, *march)
+        surface, solid = seen[..., 1] > SEEN, seen[..., 0] < SEEN
+    fine = grid.refined(surface, solid)
+    values = ops.upscale(store, grid.table, frame, fine.places, fine.frame(outside, inside))
+    if opacity == "distance":
+        values[..., 0].mul_(2.0).clamp_(-CLAMP, CLAMP)
+    return fine, values

@@ -1,0 +1,104 @@
+"""The rays of one level: every pixel whose ray passes a non-empty cell, with what its photograph says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torch_surfcap import ops
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.field.hull import grown
+from torch_surfcap.field.tiles import TileGrid
+
+BLOCK = 8  # rays are ordered in blocks of so many pixels a side, so that neighbours read the same tiles
+MARGIN = 10  # voxels that stored tiles can reach beyond the silhouette
+
+
+@dataclass
+class RayBatch:
+    """R rays and their observations, float32, in the order of cameras and pixel blocks.
+
+    origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them;
+    camera_starts: [N + 1], where each camera's rays begin.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    target: Tensor
+    background: Tensor
+    mask: Tensor
+    weight: Tensor
+    ranges: tuple[Tensor, Tensor]
+    camera_starts: list[int]
+
+    def __len__(self) -> int:
+        return len(self.mask)
+
+
+def gather_rays(capture: Capture, store: Tensor, grid: TileGrid, frame: list[float], backdrop: Tensor | None) -> RayBatch:
+    """The rays of all cameras that pass a non-empty cell of ``grid`` (the others are culled).
+
+    The weight of a ray is 1/(number of views * rho), rho = (voxel * focal / distance)^2 being the pixels that a voxel's
+    face covers: the gradient on a voxel then depends neither on the number of cameras nor on the image size nor on the
+    level.
+
+    Args:
+        backdrop: [3], the colour over which the photographs are composited with their masks; None: the plates are the
+            background and the photographs stay as they are.
+    """
+    assert capture.masks is not None
+    cameras = capture.cameras
+    low = torch.tensor(grid.origin, dtype=torch.float64)
+    center = low + torch.tensor(grid.size, dtype=torch.float64) * ops.TILE * grid.voxel_size / 2
+    distance = (cameras.centers - center).norm(dim=1)
+    focal = torch.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
+    pixels_per_voxel = grid.voxel_size * focal / distance
+    parts: list[tuple[Tensor, ...]] = []
+    starts, counts, ranges = [0], [], []
+    for i, mask in enumerate(capture.masks):
+        reach = int(torch.ceil(MARGIN * pixels_per_voxel[i])) + 1
+        index = _blocked((grown(mask, reach) > 0).nonzero())
+        origins, directions = (r.float().contiguous() for r in cameras.rays(i, index.flip(1).double() + 0.5))
+        offsets, stretches = ops.integration_ranges(store, grid.table, frame, origins, directions)
+        passes = offsets.diff()
+        hit = passes > 0
+        index, origins, directions = index[hit], origins[hit], directions[hit]
+        v, u = index.unbind(1)
+        photograph, soft = capture.photograph(i)[v, u], mask[v, u]
+        if backdrop is None:
+            background = capture.plate(i)[v, u]
+        else:
+            background = backdrop.expand_as(photograph)
+            photograph = soft[:, None] * photograph + (1 - soft[:, None]) * background
+        weight = torch.full_like(soft, 1.0 / (len(cameras) * float(pixels_per_voxel[i]) ** 2))
+        parts.append((origins, directions, photograph, background, soft, weight))
+        counts.append(passes[hit])
+        ranges.append(stretches)
+        starts.append(starts[-1] + len(index))
+    joined = [torch.cat(column).contiguous() for column in zip(*parts, strict=True)]
+    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
+    origins, directions, target, background, soft, weight = joined
+    return RayBatch(origins, directions, target, background, soft, weight, (offsets, torch.cat(ranges)), starts)
+
+
+def _blocked(index: Tensor) -> Tensor:
+    """Pixels [M, 2] (row, column) in blocks of BLOCK x BLOCK."""
+    row, column = index.unbind(1)
+    width = int(column.max()) // BLOCK + 1 if len(index) else 1
+    block = (row // BLOCK) * width + column // BLOCK
+    return index[(block * BLOCK * BLOCK + (row % BLOCK) * BLOCK + column % BLOCK).argsort()]
+
+
+def choose_backdrop(capture: Capture) -> Tensor:
+    """[3], the corner of the colour cube farthest from the subject's colours: the one whose nearest tenth of the
+    subject's pixels is farthest away."""
+    assert capture.masks is not None
+    colors = []
+    for i, mask in enumerate(capture.masks):
+        subject = capture.photograph(i)[mask > 0.9]
+        colors.append(subject[:: max(1, len(subject) // 2000)])
+    corners = torch.tensor([[i // 4, i // 2 % 2, i % 2] for i in range(8)], dtype=torch.float32)
+    distance = torch.cdist(corners, torch.cat(colors))
+    return corners[distance.quantile(0.1, dim=1).argmax()]

@@ -1,0 +1,89 @@
+"""The settings of a fit, and the defaults that were measured for each kind of field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Weights. Ray terms are means over views and over the pixels of a voxel's face, voxel terms plain sums, so one set
+    serves every level, image size and number of cameras."""
+
+    photo: float = 1.0  # Huber(colour - photograph), eq. 8
+    sample: float = 0.3  # each sample's own colour against the photograph, eq. 10
+    mask: float = 0.3  # (transmittance - (1 - mask))^2
+    huber: float = 0.1  # colour difference above which Huber's norm is linear
+    tv_opacity: float = 3e-5  # squared steps of the opacity value, eq. 9
+    tv_color: float = 1e-3  # squared steps of the colour coefficients
+    parsimony: float = 1e-3  # Huber norm of the view-dependent coefficients, eq. 11
+    ballooning: float = 0.0  # squared opacity value, eq. 12
+    detach_sample: bool = False  # the sample loss moves colours only
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Adam's rates and the lattice of samples."""
+
+    rate_opacity: float = 0.1  # of the opacity value, per iteration
+    rate_color: float = 0.06  # of the constant colour
+    rate_view: float = 0.02  # of the view-dependent coefficients
+    step: float = 3.0**0.5  # between samples, voxels
+    last_step: float = 3.0**0.5  # the same at the finest level
+    jitter: float = 1.0  # a ray's lattice is shifted by up to half this many steps, anew in every iteration
+    stop: float = 1e-3  # a ray ends when its transmittance is lower
+
+
+LOSSES = {
+    "distance": Losses(),
+    "transparency": Losses(sample=1.0, mask=0.1, tv_opacity=2e-4, ballooning=2e-5),
+}
+DESCENT = {
+    "distance": Descent(),
+    "transparency": Descent(rate_opacity=0.06),
+}
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Everything that :func:`torch_surfcap.fit` takes; None means chosen by the program.
+
+    opacity:   "distance" or "transparency", what a voxel stores
+    sh_degree: 0, 1, 2, of the colour's dependence on the direction of view
+    voxel:     edge of the finest voxels, world units; a pixel's footprint by default
+    levels:    number of resolutions; by default as many, up to 4, as the pictures can be halved
+    box:       (x0, y0, z0, x1, y1, z1) around the subject; found by default
+    threshold: opacity value of the surface. smooth: rounds of Taubin smoothing of the mesh. specks: pieces under this
+               fraction of the largest one's area are removed
+    losses, descent: see there; `losses=dict(mask=0.1)` changes one entry
+    """
+
+    opacity: str = "distance"
+    sh_degree: int | None = None
+    voxel: float | None = None
+    levels: int | None = None
+    box: tuple[float, ...] | None = None
+    seed: int = 0
+    device: str = "cpu"
+    threshold: float | None = None
+    smooth: int = 5
+    specks: float = 0.01
+    losses: Losses = field(default_factory=Losses)
+    descent: Descent = field(default_factory=Descent)
+
+    @staticmethod
+    def of(**given: Any) -> FitSettings:
+        """Settings from keyword arguments. Raises TypeError for an unknown name."""
+        opacity = given.get("opacity", FitSettings.opacity)
+        if opacity not in LOSSES:
+            raise ValueError(f"opacity: expected distance or transparency, got {opacity!r}")
+        for name, defaults in (("losses", LOSSES[opacity]), ("descent", DESCENT[opacity])):
+            value = given.get(name, {})
+            if isinstance(value, dict):
+                given[name] = replace(defaults, **{k: v for k, v in value.items() if v is not None})
+        known = {f.name for f in fields(FitSettings)}
+        unknown = set(given) - known
+        if unknown:
+            raise TypeError(f"fit: unknown setting {sorted(unknown)[0]!r}, expected one of {', '.join(sorted(known))}")
+        return FitSettings(**given)
