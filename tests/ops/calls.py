@@ -128,10 +128,12 @@ def run(module: ModuleType, name: str, arguments: Sequence[Any]) -> list[Tensor]
 
 
 def raw(name: str, arguments: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
-    """The overload in torch.ops and its arguments, which for adam_step stand in another order."""
+    """The overload in torch.ops and its arguments, which for some ops stand in another order."""
     given = tuple(cloned(arguments))
     if name == "adam_step":
         given = (*given[:7], 0.9, 0.99, 1e-8, given[7])
+    if name == "photometric_step":
+        given = (*given[:10], None, None, *given[10:])
     return getattr(torch.ops.torch_surfcap, name).default, given
 
 

@@ -39,6 +39,34 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
     return torch.stack(functions[:count], -1)
 
 
+def integration_ranges(
+    voxels: Tensor, table: Tensor, frame: Sequence[float], origins: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The stretches of rays in non-empty cells, neighbours joined (section 4.1): where each ray's begin, [R+1] long,
+    and [M,2] distances from the origin.
+    """
+    size = frame[3]
+    low = origins.new_tensor(frame[:3]) + 0.5 * size  # the low corner of the first cell
+    solid, shape = nonempty_cells(table), torch.tensor(table.shape, device=table.device)
+    offsets, ranges = [0], []
+    for origin, direction in zip(origins, directions, strict=True):
+        planes = [
+            (low[a] + TILE * size * torch.arange(int(shape[a]) + 1).to(low) - origin[a]) for a in range(3)
+        ]
+        t = torch.cat(
+            [planes[a] / direction[a] for a in range(3) if direction[a] != 0] + [origin.new_zeros(1)]
+        )
+        t = t[t >= 0].sort().values
+        middle = origin + 0.5 * (t[:-1] + t[1:])[:, None] * direction
+        cell = ((middle - low) / (TILE * size)).floor().long()
+        within = ((cell >= 0) & (cell < shape)).all(1)
+        on = within & solid[cell.clamp(min=0).minimum(shape - 1).unbind(1)]
+        edge = torch.nn.functional.pad(on.int(), (1, 1)).diff()
+        ranges.append(torch.stack([t[edge == 1], t[edge == -1]], 1))
+        offsets.append(offsets[-1] + len(ranges[-1]))
+    return torch.tensor(offsets), torch.cat([*ranges, origins.new_empty(0, 2)])
+
+
 class March(NamedTuple):
     """Samples of R rays on a lattice of K distances; after a ray's end and in empty cells a = 1."""
 
@@ -176,13 +204,15 @@ def photometric_step(
     stop: float,
     huber: float,
     weights: Sequence[float],
-    detach_sample: bool,
+    detach_sample: bool = False,
     groups: int = 1,
+    ranges: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Losses [3] (photo, sample: eq. 10, mask), gradient of weights · losses, colour [R,3], transmittance
     [R].
 
-    target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss.
+    target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss. `ranges`, which save
+    the compiled op a search, are not looked at.
     """
     leaf = voxels.detach().requires_grad_()
     m = march(leaf, table, frame, origins, directions, shift, opacity, slope, step, stop)
