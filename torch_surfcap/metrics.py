@@ -24,7 +24,7 @@ def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     Returns:
         dB; inf for equal pictures, NaN where the mask is empty.
     """
-    image, truth = image.detach().cpu().double().clamp(0, 1), truth.detach().cpu().double().clamp(0, 1)
+    image, truth = (x.detach().cpu().float().clamp(0, 1) for x in (image, truth))
     if mask is not None:
         inside = mask.cpu() > 0.5
         image, truth = image[inside], truth[inside]

@@ -20,7 +20,7 @@ from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.metrics import psnr, ssim
-from torch_surfcap.surface.render import colored, mesh_mask, raster, shaded, volume
+from torch_surfcap.surface.render import cast, colored, mesh_mask, raster, shaded, volume
 
 if TYPE_CHECKING:
     from torch_surfcap.field.field import SurfaceField
@@ -69,7 +69,8 @@ def score_view(
     psnr_raster_masked where the mask is over 0.5; silhouette_iou of the mesh against that mask."""
     truth, behind = scene_photograph(capture, i, background), scene_background(capture, i, background)
     through = volume(field, capture.cameras, i, behind)
-    onto = raster(field, mesh, capture.cameras, i, behind)
+    hits = cast(mesh, capture.cameras, i)
+    onto = raster(field, mesh, capture.cameras, i, behind, hits)
     scores = {
         "psnr_volume": psnr(through, truth),
         "psnr_raster": psnr(onto, truth),
@@ -79,7 +80,7 @@ def score_view(
         mask = capture.masks[i] > 0.5
         scores["psnr_masked"] = psnr(through, truth, mask)
         scores["psnr_raster_masked"] = psnr(onto, truth, mask)
-        covered = mesh_mask(mesh, capture.cameras, i) > 0.5
+        covered = mesh_mask(mesh, capture.cameras, i, hits) > 0.5
         scores["silhouette_iou"] = float((mask & covered).sum() / (mask | covered).sum().clamp(min=1))
     return scores
 
@@ -119,12 +120,12 @@ def write_preview(
     """PNG with a row per view (a few spread ones if None): photograph, volume, raster, shaded geometry."""
     rows = []
     for i in some_views(len(capture), PREVIEWED) if views is None else views:
-        behind = scene_background(capture, i, background)
+        behind, hits = scene_background(capture, i, background), cast(mesh, capture.cameras, i)
         pictures = [
             scene_photograph(capture, i, background),
             volume(field, capture.cameras, i, behind),
-            raster(field, mesh, capture.cameras, i, behind),
-            shaded(mesh, capture.cameras, i),
+            raster(field, mesh, capture.cameras, i, behind, hits),
+            shaded(mesh, capture.cameras, i, hits=hits),
         ]
         rows.append(np.concatenate([_cell(p) for p in pictures], axis=1))
     width = max(row.shape[1] for row in rows)

@@ -11,13 +11,14 @@ from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.surface.extract import extract_mesh
 from torch_surfcap.surface.render import (
     GREY,
-    meets_box,
+    cast,
     mesh_depth,
     mesh_mask,
     mesh_normals,
     raster,
     shaded,
     volume,
+    window,
 )
 
 WIDTH, HEIGHT, AWAY = 60, 48, 2.0
@@ -137,16 +138,22 @@ def test_background_of_another_size_is_refused(
         raster(field, mesh, cameras, 0, torch.zeros(2, 2, 3))
 
 
-def test_rays_and_a_box_by_hand() -> None:
-    low, high = torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    rays = {
-        "through": ([-1.0, 0.5, 0.5], [1.0, 0, 0], True),
-        "behind": ([-1.0, 0.5, 0.5], [-1.0, 0, 0], False),
-        "beside": ([-1.0, 1.5, 0.5], [1.0, 0, 0], False),
-        "from within": ([0.5, 0.5, 0.5], [0, 0, -1.0], True),
-        "along a face": ([-1.0, 1.0, 0.5], [1.0, 0, 0], True),
-        "past a corner": ([-1.0, 0.5, 0.5], [0.6, 0.8, 0], False),
-    }
-    origins, directions = (torch.tensor([r[j] for r in rays.values()], dtype=torch.float64) for j in (0, 1))
-    found = meets_box(origins, directions, low, high)
-    assert dict(zip(rays, found.tolist(), strict=True)) == {name: ray[2] for name, ray in rays.items()}
+def test_window_by_hand(cameras: Cameras) -> None:
+    # A unit cube a focal length of 80 away: half of it, 0.5 * 80 / (2 - 0.5) = 26.67 pixels to each side of (30, 24).
+    center = torch.from_numpy(CENTER)
+    pixels = window(cameras, 0, center - 0.5, center + 0.5)
+    columns, rows = pixels % WIDTH, pixels // WIDTH
+    assert (int(columns.min()), int(columns.max())) == (3, 56)
+    assert (int(rows.min()), int(rows.max())) == (0, HEIGHT - 1)
+    assert len(pixels) == 54 * HEIGHT
+    beside = torch.tensor([5.0, 0, 0])
+    assert len(window(cameras, 0, center + beside - 0.5, center + beside + 0.5)) == 0
+    around_the_camera = torch.tensor([0.0, 0, 5])
+    assert len(window(cameras, 0, center - around_the_camera, center)) == WIDTH * HEIGHT
+
+
+@pytest.mark.parametrize("i", [0, 1])
+def test_window_leaves_out_no_hit(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> None:
+    origins, directions = cameras.rays(i)
+    face = mesh.ray.intersects_first(origins.numpy(), directions.numpy())
+    assert (cast(mesh, cameras, i).pixel == np.flatnonzero(face >= 0)).all()

@@ -50,19 +50,40 @@ class Hits:
         return out.reshape(*self.size, -1)
 
 
+def window(cameras: Cameras, i: int, low: Tensor, high: Tensor) -> Tensor:
+    """Row-major numbers [M] of the pixels of camera i in which a box (corners [3], world units) can be seen: a
+    rectangle, or all pixels where a part of the box is not in front of the camera."""
+    width, height = (int(s) for s in cameras.size[i])
+    corners = torch.cartesian_prod(*torch.stack([low, high], dim=1).double())
+    uv, depth = cameras.project(i, corners)
+    left, top, right, bottom = 0, 0, width, height
+    if (depth > 0).all():
+        left, top = (max(0, int(x)) for x in uv.amin(dim=0).clamp(-1, 1e6).floor())
+        right, bottom = (int(x) for x in torch.minimum(uv.amax(dim=0).clamp(min=0).ceil(), cameras.size[i]))
+    rows, columns = torch.arange(top, max(top, bottom)), torch.arange(left, max(left, right))
+    return (rows[:, None] * width + columns).reshape(-1)
+
+
+def pixel_rays(cameras: Cameras, i: int, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions [M, 3] of the rays through the centres of the pixels numbered [M]."""
+    width = int(cameras.size[i, 0])
+    return cameras.rays(i, torch.stack([pixels % width, pixels // width], dim=1) + 0.5)
+
+
 def cast(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Hits:
     """First hits of the rays through camera i's pixel centres.
 
     The ray caster finds the triangle in single precision; the point is then taken on its plane in double.
     """
     width, height = (int(s) for s in cameras.size[i])
-    origins, directions = (x.numpy() for x in cameras.rays(i))
-    if len(mesh.faces) == 0:
-        face = np.full(len(origins), -1)
-    else:
+    box = np.zeros((2, 3)) if len(mesh.faces) == 0 else np.array(mesh.bounds)
+    pixels = window(cameras, i, *torch.from_numpy(box))
+    origins, directions = (x.numpy() for x in pixel_rays(cameras, i, pixels))
+    face = np.full(len(pixels), -1)
+    if len(mesh.faces) and len(pixels):
         face = np.asarray(mesh.ray.intersects_first(origins, directions), dtype=np.int64)
-    pixel = np.flatnonzero(face >= 0)
-    face, origins, directions = face[pixel], origins[pixel], directions[pixel]
+    hit = np.flatnonzero(face >= 0)
+    face, origins, directions = face[hit], origins[hit], directions[hit]
     offset = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)[face]] - origins[:, None]
     normal = np.cross(offset[:, 1] - offset[:, 0], offset[:, 2] - offset[:, 0])
     slope = row_dot(normal, directions)
@@ -70,14 +91,23 @@ def cast(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Hits:
     # Grazing rays: no farther out than the triangle itself.
     along = np.einsum("ijk,ik->ij", offset, directions)
     distance = np.clip(distance, along.min(axis=1, initial=np.inf), along.max(axis=1, initial=-np.inf))
-    return Hits((height, width), pixel, face, origins + distance[:, None] * directions, directions, distance)
+    point = origins + distance[:, None] * directions
+    return Hits((height, width), pixels.numpy()[hit], face, point, directions, distance)
 
 
 def raster(
-    field: SurfaceField, mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background
+    field: SurfaceField,
+    mesh: trimesh.Trimesh,
+    cameras: Cameras,
+    i: int,
+    background: Background,
+    hits: Hits | None = None,
 ) -> Tensor:
-    """[H, W, 3]: the field's colour, in the direction of the ray, at the first point of the mesh in each pixel."""
-    hits = cast(mesh, cameras, i)
+    """[H, W, 3]: the field's colour, in the direction of the ray, at the first point of the mesh in each pixel.
+
+    hits: what `cast` found for this mesh and camera, where it is known already.
+    """
+    hits = cast(mesh, cameras, i) if hits is None else hits
     colors = torch.zeros(len(hits.pixel), 3)
     with torch.no_grad():
         for s in range(0, len(colors), CHUNK):
@@ -89,15 +119,13 @@ def raster(
 
 
 def volume(field: SurfaceField, cameras: Cameras, i: int, background: Background) -> Tensor:
-    """[H, W, 3]: the integral of the field along each pixel's ray. Only rays that meet the field's box are marched."""
+    """[H, W, 3]: the integral of the field along each pixel's ray, marched where the field's box can be seen."""
     width, height = (int(s) for s in cameras.size[i])
-    origins, directions = cameras.rays(i)
     out = backdrop(background, (height, width))
-    inside = torch.nonzero(meets_box(origins, directions, *field_box(field)))[:, 0]
     with torch.no_grad():
-        for rows in inside.split(CHUNK):
-            o, d, behind = (x[rows].to(field.voxels) for x in (origins, directions, out))
-            out[rows] = field(o, d, background=behind).color.cpu().float()
+        for pixels in window(cameras, i, *field_box(field)).split(CHUNK):
+            origins, directions = pixel_rays(cameras, i, pixels)
+            out[pixels] = field(origins, directions, background=out[pixels]).color.cpu().float()
     return out.reshape(height, width, 3)
 
 
@@ -109,26 +137,19 @@ def field_box(field: SurfaceField) -> tuple[Tensor, Tensor]:
     return low + 3 * field.voxel_size, low + (4 * tiles - 3) * field.voxel_size
 
 
-def meets_box(origins: Tensor, directions: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """[R] bool: whether each ray (origins, directions [R, 3], forwards only) meets the box between two corners."""
-    # Where a direction has no component along an axis, 1 / 0 = inf gives the slab's interval all or nothing.
-    to_low, to_high = (low - origins) / directions, (high - origins) / directions
-    near = torch.minimum(to_low, to_high).nan_to_num(nan=-torch.inf).amax(dim=1)
-    far = torch.maximum(to_low, to_high).nan_to_num(nan=torch.inf).amin(dim=1)
-    return far >= near.clamp(min=0)
-
-
-def shaded(mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background = 1.0) -> Tensor:
+def shaded(
+    mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background = 1.0, hits: Hits | None = None
+) -> Tensor:
     """[H, W, 3]: grey matt geometry under a lamp at the camera, shaded flat per face, so that steps show."""
-    hits = cast(mesh, cameras, i)
+    hits = cast(mesh, cameras, i) if hits is None else hits
     light = GREY * np.abs(row_dot(_normals(mesh, hits), hits.direction))
     values = torch.from_numpy(light)[:, None].expand(-1, 3)
     return hits.picture(values, backdrop(background, hits.size))
 
 
-def mesh_mask(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Tensor:
+def mesh_mask(mesh: trimesh.Trimesh, cameras: Cameras, i: int, hits: Hits | None = None) -> Tensor:
     """[H, W]: 1 where the pixel's centre sees the mesh, else 0."""
-    hits = cast(mesh, cameras, i)
+    hits = cast(mesh, cameras, i) if hits is None else hits
     return hits.picture(torch.ones(len(hits.pixel), 1), torch.zeros(hits.size[0] * hits.size[1], 1))[:, :, 0]
 
 
