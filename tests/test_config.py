@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from torch_surfcap import config
 from torch_surfcap.config import Config
 from torch_surfcap.errors import InputError
+from torch_surfcap.fitting.settings import Descent, FitSettings, Losses
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 
@@ -111,6 +113,22 @@ def test_wrong_file_is_named(tmp_path: Path, text: str, message: str) -> None:
 def test_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.yaml: cannot read this config file"):
         config.load(tmp_path / "nowhere.yaml")
+
+
+def test_defaults_are_the_librarys() -> None:
+    assert FitSettings.of(**config.fit_arguments(Config())) == FitSettings.of()
+    changed = config.load(
+        None, ["opacity=transparency", "losses.mask=0.5", "descent.stop=1e-4", "data.box=[0,0,0,1,1,1]"]
+    )
+    expected = {"losses": {"mask": 0.5}, "descent": {"stop": 1e-4}, "box": (0, 0, 0, 1, 1, 1)}
+    assert FitSettings.of(**config.fit_arguments(changed)) == FitSettings.of(
+        opacity="transparency", **expected
+    )
+
+
+def test_losses_and_descent_mirror_the_library() -> None:
+    for mine, theirs in ((config.LossesConfig, Losses), (config.DescentConfig, Descent)):
+        assert [f.name for f in fields(mine)] == [f.name for f in fields(theirs)]
 
 
 def test_every_key_has_a_meaning() -> None:

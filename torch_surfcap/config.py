@@ -20,6 +20,7 @@ from yaml import YAMLError
 
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
+from torch_surfcap.fitting.settings import LOSSES, FitSettings
 
 
 def _one_of(default: Any, *values: Any) -> Any:
@@ -47,14 +48,28 @@ class DataConfig:
 class LossesConfig:
     """Weights of terms that are normalised so that one set serves every level; auto depends on `opacity`."""
 
+    photo: float | None = _within(None, 0)  # weight of a ray's colour against the photograph
     sample: float | None = _within(None, 0)  # weight of each sample's own colour against the photograph
     mask: float | None = _within(None, 0)  # weight of transmittance against the silhouette
-    huber: float = _within(0.1, 1e-6)  # colour difference (0 to 1) above which Huber's norm is linear
+    huber: float | None = _within(None, 1e-6)  # colour difference (0 to 1) above which Huber's norm is linear
     tv_opacity: float | None = _within(None, 0)  # weight of squared steps of the opacity value between voxels
     tv_color: float | None = _within(None, 0)  # weight of squared steps of the colour between voxels
     parsimony: float | None = _within(None, 0)  # weight of Huber's norm of the view-dependent coefficients
-    ballooning: float | None = _within(None, 0)  # weight of squared transparency
-    eikonal: float | None = _within(None, 0)  # weight of a distance's slope against 1
+    ballooning: float | None = _within(None, 0)  # weight of the squared opacity value
+    detach_sample: bool | None = None  # the sample loss moves colours only
+
+
+@dataclass
+class DescentConfig:
+    """Adam and the samples on a ray; auto depends on `opacity`."""
+
+    rate_opacity: float | None = _within(None, 0)  # step of the opacity value, per iteration
+    rate_color: float | None = _within(None, 0)  # step of the constant colour, per iteration
+    rate_view: float | None = _within(None, 0)  # step of the view-dependent coefficients, per iteration
+    step: float | None = _within(None, 0.1, 10)  # between samples, voxels
+    last_step: float | None = _within(None, 0.1, 10)  # the same at the finest level, voxels
+    jitter: float | None = _within(None, 0, 1)  # span of the random shifts of a ray's samples, steps
+    stop: float | None = _within(None, 0, 1)  # transmittance below which a ray ends
 
 
 @dataclass
@@ -65,8 +80,8 @@ class CamerasConfig:
 @dataclass
 class MeshConfig:
     threshold: float | None = None  # opacity value of the surface; auto: 0.81 transparency, 0 distance
-    smooth: int | None = _within(None, 0)  # rounds of Taubin smoothing
-    specks: float = _within(0.01, 0, 1)  # pieces below this fraction of the largest one's area are removed
+    smooth: int = _within(FitSettings.smooth, 0)  # rounds of Taubin smoothing
+    specks: float = _within(FitSettings.specks, 0, 1)  # pieces under this fraction of the largest area go
 
 
 @dataclass
@@ -78,8 +93,9 @@ class Config:
     sh_degree: int | None = _one_of(None, 0, 1, 2)  # of the colour's dependence on the direction of view
     voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
-    opacity: str = _one_of("transparency", "transparency", "distance")  # what a voxel stores
+    opacity: str = _one_of(FitSettings.opacity, *LOSSES)  # what a voxel stores
     losses: LossesConfig = field(default_factory=LossesConfig)
+    descent: DescentConfig = field(default_factory=DescentConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     overwrite: bool = False  # replace the results in `out`
@@ -113,6 +129,23 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Sequence[str] = 
     assert isinstance(config, Config)
     _check(config, str(path or "settings"))
     return config
+
+
+def fit_arguments(config: Config) -> dict[str, Any]:
+    """What `torch_surfcap.fit` takes of a config, but for the device, which the command chooses."""
+    return {
+        "opacity": config.opacity,
+        "sh_degree": config.sh_degree,
+        "voxel": config.voxel,
+        "levels": config.levels,
+        "box": None if config.data.box is None else tuple(config.data.box),
+        "seed": config.seed,
+        "threshold": config.mesh.threshold,
+        "smooth": config.mesh.smooth,
+        "specks": config.mesh.specks,
+        "losses": dict(vars(config.losses)),
+        "descent": dict(vars(config.descent)),
+    }
 
 
 def save(config: Config, path: str | os.PathLike[str]) -> None:

@@ -81,7 +81,7 @@ def test_no_rays_and_no_tiles(device: str) -> None:
 
 def test_opcheck(device: str) -> None:
     torch.library.opcheck(
-        torch.ops.torch_surfcap.integration_ranges.default, fewer(make_scene(device=device), 5)
+        torch.ops.torch_surfcap.integration_ranges.default, tuple(fewer(make_scene(device=device), 5))
     )
 
 
