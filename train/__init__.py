@@ -1,0 +1,1 @@
+"""Commands: each reads its settings, calls the library, prints and saves."""
