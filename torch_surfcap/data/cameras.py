@@ -15,7 +15,9 @@ from torch import Tensor
 
 from torch_surfcap.errors import InputError
 
-ROTATION_TOLERANCE = 1e-3  # largest accepted entry of |R R^T - I|: text files round, wrong matrices miss by far more
+ROTATION_TOLERANCE = (
+    1e-3  # largest accepted entry of |R R^T - I|: text files round, wrong matrices miss by far more
+)
 
 
 def calibration_fault(K: Tensor, world_to_camera: Tensor) -> str | None:

@@ -10,8 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_surfcap.data.cameras import Cameras, calibration_fault
-from torch_surfcap.data.images import as_float, shrink
+from torch_surfcap.data.arrays import as_cameras, as_mask, as_picture, float_tensor, same_count, size_text
+from torch_surfcap.data.cameras import Cameras
+from torch_surfcap.data.checks import prepare
+from torch_surfcap.data.images import shrink
+from torch_surfcap.data.load import load_views, without
+from torch_surfcap.data.readers import read_views
+from torch_surfcap.data.view import View
 from torch_surfcap.errors import InputError
 
 Pictures = Sequence[Any] | Tensor | np.ndarray
@@ -49,12 +54,17 @@ class Capture:
         plates: Pictures | None = None,
         names: Sequence[str] | None = None,
     ) -> None:
-        self.names = [f"{i:03d}" for i in range(len(images))] if names is None else [str(name) for name in names]
-        _same_count(len(images), names=self.names, masks=masks, plates=plates)
+        self.names = (
+            [f"{i:03d}" for i in range(len(images))] if names is None else [str(name) for name in names]
+        )
+        same_count(len(images), names=self.names, masks=masks, plates=plates)
         if len(set(self.names)) != len(self.names):
             twice = next(name for name in self.names if self.names.count(name) > 1)
             raise InputError(f"camera {twice}: this name is given twice, expected one name per camera")
-        pictures = [_picture(image, f"image of camera {name}") for image, name in zip(images, self.names, strict=True)]
+        pictures = [
+            as_picture(image, f"image of camera {name}")
+            for image, name in zip(images, self.names, strict=True)
+        ]
         self.images: list[Tensor] = [picture[..., :3].contiguous() for picture in pictures]
         self.mask_source: str | None = "file" if masks is not None else None
         if masks is None and pictures and all(picture.shape[2] == 4 for picture in pictures):
@@ -62,17 +72,24 @@ class Capture:
             self.mask_source = "alpha"
         self.masks: list[Tensor] | None = None
         if masks is not None:
-            self.masks = [_mask(mask, f"mask of camera {name}") for mask, name in zip(masks, self.names, strict=True)]
+            self.masks = [
+                as_mask(mask, f"mask of camera {name}") for mask, name in zip(masks, self.names, strict=True)
+            ]
         self.plates: list[Tensor] | None = None
         if plates is not None:
-            found = [_picture(plate, f"plate of camera {name}") for plate, name in zip(plates, self.names, strict=True)]
+            found = [
+                as_picture(plate, f"plate of camera {name}")
+                for plate, name in zip(plates, self.names, strict=True)
+            ]
             self.plates = [plate[..., :3].contiguous() for plate in found]
         size = torch.tensor([[i.shape[1], i.shape[0]] for i in self.images], dtype=torch.int64).reshape(-1, 2)
         for kind, others in (("mask", self.masks), ("plate", self.plates)):
             for name, image, other in zip(self.names, self.images, others or self.images, strict=True):
                 if image.shape[:2] != other.shape[:2]:
-                    raise InputError(f"{kind} of camera {name}: {_size(other)}, expected the image's {_size(image)}")
-        self.cameras = _cameras(K, world_to_camera, size, self.names)
+                    raise InputError(
+                        f"{kind} of camera {name}: {size_text(other)}, expected the image's {size_text(image)}"
+                    )
+        self.cameras = as_cameras(K, world_to_camera, size, self.names)
         self.warnings: list[str] = []
         self.test: Capture | None = None
         self.prepared = False
@@ -87,13 +104,13 @@ class Capture:
 
     def photograph(self, i: int) -> Tensor:
         """Image i as float32 [H,W,3] in [0, 1]."""
-        return _as_float(self.images[i])
+        return float_tensor(self.images[i])
 
     def plate(self, i: int) -> Tensor:
         """Plate i as float32 [H,W,3] in [0, 1]; a capture without plates has none to give (ValueError)."""
         if self.plates is None:
             raise ValueError("this capture has no plates")
-        return _as_float(self.plates[i])
+        return float_tensor(self.plates[i])
 
     def subset(self, indices: Sequence[int] | Tensor) -> Capture:
         """The views at `indices`, in that order; pictures are shared, held-out views and warnings stay."""
@@ -165,66 +182,23 @@ def load_capture(
     Masks are never None afterwards. Cameras that see nothing useful are left out and named in `.warnings`.
     Raises InputError (one line: file, found, expected) for anything that cannot be used.
     """
-    from torch_surfcap.data.load import load_views  # the loader builds captures: imported late, it needs this module
-    from torch_surfcap.data.readers import read_views
-
-    return load_views(read_views(Path(path), format), scale, holdout, masks, plates, tuple(skip))
-
-
-def _as_float(image: Tensor) -> Tensor:
-    return torch.from_numpy(as_float(image.numpy()))
-
-
-def _size(picture: Tensor) -> str:
-    return f"{picture.shape[1]} x {picture.shape[0]} pixels"
-
-
-def _same_count(count: int, **others: Any) -> None:
-    for what, values in others.items():
-        if values is not None and len(values) != count:
-            raise InputError(f"capture: {len(values)} {what} for {count} images, expected one each")
+    views = read_views(Path(path), format)
+    named = any(view.held_out for view in views)
+    if holdout and not named:
+        for view in views[::holdout]:
+            view.held_out = True
+    views = without(views, skip)
+    capture = _from_views([view for view in views if not view.held_out], scale, masks, plates)
+    if holdout and named:
+        capture.warnings.append(f"holdout={holdout} is ignored: the capture itself names its held-out views")
+    held_out = [view for view in views if view.held_out]
+    if held_out:
+        capture.test = _from_views(held_out, scale, masks, plates)
+    return prepare(capture)
 
 
-def _tensor(values: Any) -> Tensor:
-    array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
-    if array.dtype == np.uint16:
-        array = array.astype(np.float32) / np.float32(65535)
-    elif array.dtype != np.uint8:
-        array = array.astype(np.float32)
-    return torch.from_numpy(np.ascontiguousarray(array))
-
-
-def _picture(values: Any, what: str) -> Tensor:
-    picture = _tensor(values)
-    if picture.ndim != 3 or picture.shape[2] not in (3, 4) or picture.numel() == 0:
-        raise InputError(f"{what}: shape {list(picture.shape)}, expected [height, width, 3 or 4]")
-    return picture
-
-
-def _mask(values: Any, what: str) -> Tensor:
-    mask = _tensor(values)
-    if mask.ndim == 3 and mask.shape[2] == 1:
-        mask = mask[:, :, 0]
-    if mask.ndim != 2:
-        raise InputError(f"{what}: shape {list(mask.shape)}, expected [height, width]")
-    return _as_float(mask).clamp(0.0, 1.0)
-
-
-def _cameras(K: Any, world_to_camera: Any, size: Tensor, names: list[str]) -> Cameras:
-    K = torch.as_tensor(K, dtype=torch.float64, device="cpu")
-    pose = torch.as_tensor(world_to_camera, dtype=torch.float64, device="cpu")
-    if K.ndim == 2:
-        K = K.expand(len(names), 3, 3).clone()
-    if pose.ndim == 3 and pose.shape[1:] == (3, 4):
-        last = pose.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(pose), 1, 4)
-        pose = torch.cat([pose, last], dim=1)
-    _same_count(len(names), **{"matrices K": K, "matrices world_to_camera": pose})
-    if K.shape[1:] != (3, 3) or pose.shape[1:] != (4, 4):
-        raise InputError(
-            f"capture: K {list(K.shape)} and world_to_camera {list(pose.shape)}, expected [N,3,3] and [N,4,4]"
-        )
-    for i, name in enumerate(names):
-        fault = calibration_fault(K[i], pose[i])
-        if fault:
-            raise InputError(f"camera {name}: {fault}")
-    return Cameras(K, pose, size)
+def _from_views(views: list[View], scale: float, masks: bool, plates: bool) -> Capture:
+    read = load_views(views, scale, masks, plates)
+    capture = Capture(read.images, read.K, read.world_to_camera, read.masks, read.plates, read.names)
+    capture.mask_source = read.mask_source
+    return capture

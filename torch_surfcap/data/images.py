@@ -32,7 +32,9 @@ def _decode(path: Path) -> Picture:
     cut = data[:4] == b"\x89PNG" and b"IEND" not in data[-64:]
     pixels = None if cut else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
-        raise InputError(f"{path}: damaged or no picture ({len(data)} bytes), expected a PNG, JPEG or TIFF picture")
+        raise InputError(
+            f"{path}: damaged or no picture ({len(data)} bytes), expected a PNG, JPEG or TIFF picture"
+        )
     return pixels
 
 
@@ -76,10 +78,11 @@ def read_mask(path: Path) -> Plane:
     """Mask [H,W], float32, 1 on the subject. Label pictures with values 0 and 1 are understood."""
     raw = _decode(path)
     if raw.ndim == 3:
-        raw = raw[:, :, :1] if raw.shape[2] == 2 else raw[:, :, :3]
+        grey = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}.get(raw.shape[2])
+        raw = raw[:, :, 0] if grey is None else cv2.cvtColor(raw, grey)
     labels = raw.dtype.kind == "u" and raw.max() == 1
     plane = raw.astype(np.float32) if labels else as_float(_unit(raw, path))
-    return np.clip(plane if plane.ndim == 2 else plane.mean(axis=2), 0.0, 1.0).astype(np.float32)
+    return np.clip(plane, 0.0, 1.0)
 
 
 def undistort(pixels: Picture, K: NDArray[np.float64], distortion: tuple[float, ...]) -> Picture:
@@ -93,10 +96,15 @@ def undistort(pixels: Picture, K: NDArray[np.float64], distortion: tuple[float, 
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     rays = np.linalg.solve(centred, np.stack([u.ravel(), v.ravel(), np.ones(u.size)]))
     # initUndistortRectifyMap ignores the skew of K, so the rays are bent by projectPoints and given K's skew here
-    bent, _ = cv2.projectPoints(rays.T.copy(), np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion, np.float64))
+    bent, _ = cv2.projectPoints(
+        rays.T.copy(), np.zeros(3), np.zeros(3), np.eye(3), np.array(distortion, np.float64)
+    )
     source = bent.reshape(-1, 2) @ centred[:2, :2].T + centred[:2, 2]
     x, y = (source[:, axis].reshape(height, width).astype(np.float32) for axis in (0, 1))
-    return cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    straight: Picture = cv2.remap(
+        pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    return straight
 
 
 def shrink(pixels: Picture, size: tuple[int, int], weight: Plane | None = None) -> Plane:
@@ -105,9 +113,14 @@ def shrink(pixels: Picture, size: tuple[int, int], weight: Plane | None = None) 
     With `weight` [H,W] it is the weighted mean, and the plain one where all weights are 0: a photograph that will be
     composited with its mask m keeps mean(m·C) = mean(m)·result, so compositing and shrinking may change places.
     """
-    plain = cv2.resize(as_float(pixels), size, interpolation=cv2.INTER_AREA)
     if weight is None:
-        return plain
-    mean = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)[:, :, None]
-    weighted = cv2.resize(as_float(pixels) * weight[:, :, None], size, interpolation=cv2.INTER_AREA)
-    return np.where(mean > 1e-6, weighted / np.maximum(mean, 1e-6), plain).astype(np.float32)
+        return _area(as_float(pixels), size)
+    peak = 255.0 if pixels.dtype == np.uint8 else 1.0
+    mean = np.maximum(_area(weight, size), 1e-6)[:, :, None]
+    weighted = cv2.multiply(pixels, cv2.merge([weight] * pixels.shape[2]), scale=1 / peak, dtype=cv2.CV_32F)
+    plain = as_float(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+    return np.where(mean > 1e-6, _area(weighted, size) / mean, plain)
+
+
+def _area(pixels: Picture, size: tuple[int, int]) -> Plane:
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
