@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from torch_surfcap.data.files import atomic_write
+from torch_surfcap.data.readers import FORMATS
 from torch_surfcap.errors import InputError
 from torch_surfcap.fitting.settings import LOSSES, FitSettings
 
@@ -36,7 +37,7 @@ def _within(default: Any, low: float, high: float = float("inf")) -> Any:
 @dataclass
 class DataConfig:
     path: str = ""  # the capture's folder or calibration file; must be given
-    format: str = _one_of("auto", "auto", "transforms", "idr", "middlebury", "rig")  # of the calibration
+    format: str = _one_of("auto", "auto", *FORMATS)  # of the calibration
     scale: float = _within(1.0, 1e-3, 1.0)  # size of the pictures used, as a fraction of the files'
     holdout: int = _within(0, 0)  # every so many-th view is kept for testing; 0: those that the capture names
     masks: bool = True  # use mask files and alpha channels
