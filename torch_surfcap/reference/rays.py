@@ -39,38 +39,11 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
     return torch.stack(functions[:count], -1)
 
 
-def integration_ranges(
-    voxels: Tensor, table: Tensor, frame: Sequence[float], origins: Tensor, directions: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The stretches of rays in non-empty cells, neighbours joined (section 4.1): where each ray's begin, [R+1] long,
-    and [M,2] distances from the origin.
-    """
-    size = frame[3]
-    low = origins.new_tensor(frame[:3]) + 0.5 * size  # the low corner of the first cell
-    solid, shape = nonempty_cells(table), torch.tensor(table.shape, device=table.device)
-    offsets, ranges = [0], []
-    for origin, direction in zip(origins, directions, strict=True):
-        planes = [
-            (low[a] + TILE * size * torch.arange(int(shape[a]) + 1).to(low) - origin[a]) for a in range(3)
-        ]
-        t = torch.cat(
-            [planes[a] / direction[a] for a in range(3) if direction[a] != 0] + [origin.new_zeros(1)]
-        )
-        t = t[t >= 0].sort().values
-        middle = origin + 0.5 * (t[:-1] + t[1:])[:, None] * direction
-        cell = ((middle - low) / (TILE * size)).floor().long()
-        within = ((cell >= 0) & (cell < shape)).all(1)
-        on = within & solid[cell.clamp(min=0).minimum(shape - 1).unbind(1)]
-        edge = torch.nn.functional.pad(on.int(), (1, 1)).diff()
-        ranges.append(torch.stack([t[edge == 1], t[edge == -1]], 1))
-        offsets.append(offsets[-1] + len(ranges[-1]))
-    return torch.tensor(offsets), torch.cat([*ranges, origins.new_empty(0, 2)])
-
-
 class March(NamedTuple):
     """Samples of R rays on a lattice of K distances; after a ray's end and in empty cells a = 1."""
 
     t: Tensor  # [R,K] distance from the origin
+    value: Tensor  # [R,K] opacity value
     a: Tensor  # [R,K] transparency
     color: Tensor  # [R,K,3]
     transmittance: Tensor  # [R,K+1] exclusive: what is left before sample k, and at the end
@@ -131,7 +104,7 @@ def march(
     alive = torch.cumprod(torch.nn.functional.pad(left[:, :-1], (1, 0), value=True), 1).bool()
     a = torch.where(alive, a, 1)
     transmittance = torch.cat([a.new_ones(len(a), 1), torch.cumprod(a, 1)], 1)
-    return March(t, a, color, transmittance, active & alive, index, corner)
+    return March(t, value, a, color, transmittance, active & alive, index, corner)
 
 
 def march_forward(
@@ -248,3 +221,35 @@ def visibility(
         values = quantity[..., None].expand_as(row)[reads].detach()
         seen[:, channel].scatter_reduce_(0, row[reads], values, "amax")
     return seen.view(-1, TILE, TILE, TILE, 2)
+
+
+def integration_ranges(
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    opacity: int,
+    slope: float,
+    step: float,
+    stop: float,
+    quiet: float,
+) -> tuple[Tensor, Tensor]:
+    """The stretches of rays worth sampling (section 4.1): where each ray's begin [R+1] long, and [M,2] distances.
+
+    They reach a step to either side of every sample with a value under `quiet`, and two more behind the last sample.
+    """
+    m = march(voxels, table, frame, origins, directions, shift, opacity, slope, step, stop)
+    offsets, ranges = [0], list[list[float]]()
+    for t, value, visited in zip(m.t, m.value, m.visited, strict=True):
+        t, value = t[visited], value[visited]
+        reach = torch.full_like(t, step)
+        reach[-1:] = 3 * step
+        for begin, end in torch.stack([t - step, t + reach], 1)[value < quiet].tolist():
+            if len(ranges) > offsets[-1] and begin <= ranges[-1][1] + 1e-9 * step:
+                ranges[-1][1] = end
+            else:
+                ranges.append([begin, end])
+        offsets.append(len(ranges))
+    return torch.tensor(offsets), origins.new_tensor(ranges).view(-1, 2)
