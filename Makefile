@@ -49,8 +49,9 @@ $(LIBRARY): setup.py $(CSRC) | $(STAMP)
 	@touch $@
 
 fit: setup
+	$(BIN)/python -m torch_surfcap.data.sample_scene data/sample
 	$(BIN)/python train/fit.py --config configs/sample.yaml
-	$(BIN)/python train/evaluate.py --run out/sample
+	$(BIN)/python train/evaluate.py --run out/sample --mesh-truth data/sample/gt.ply
 
 test: setup
 	$(BIN)/python -m pytest
