@@ -14,7 +14,8 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
         ", int groups) -> Tensor");
   m.def("photometric_step(" FIELD ", " RAYS ", Tensor target, Tensor mask, Tensor weight, "
         "Tensor? range_offsets, Tensor? ranges, " MARCH ", float huber, float[] weights, bool detach_sample, int groups) -> (Tensor, Tensor, Tensor, Tensor)");
-  m.def("integration_ranges(" FIELD ", Tensor origins, Tensor directions) -> (Tensor, Tensor)");
+  m.def("integration_ranges(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH
+        ", float quiet) -> (Tensor, Tensor)");
   m.def("visibility(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH ", int groups) -> Tensor");
   m.def("voxel_terms(" FIELD
         ", Tensor coordinates, float[] weights, float huber, Tensor(a!) gradient) -> Tensor");

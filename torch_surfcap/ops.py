@@ -160,14 +160,27 @@ def photometric_step(
 
 
 def integration_ranges(
-    voxels: Tensor, table: Tensor, frame: list[float], origins: Tensor, directions: Tensor
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    opacity: int,
+    slope: float,
+    step: float,
+    stop: float,
+    quiet: float,
 ) -> tuple[Tensor, Tensor]:
-    """The stretches of rays in non-empty cells (paper, section 4.1), front to back, neighbours joined.
+    """The stretches of rays that are worth sampling (paper, section 4.1), front to back.
+
+    They reach a step beyond the samples whose opacity value is under ``quiet``, and two steps beyond where a ray ends.
 
     Returns:
         offsets [R + 1] int64, where each ray's ranges begin, and ranges [M, 2]: begin and end, world units from the origin.
     """
-    return cast("tuple[Tensor, Tensor]", _ops.integration_ranges(voxels, table, frame, origins, directions))
+    field, rays, march = (voxels, table, frame), (origins, directions, shift), (opacity, slope, step, stop)
+    return cast("tuple[Tensor, Tensor]", _ops.integration_ranges(*field, *rays, *march, quiet))
 
 
 def visibility(
@@ -278,7 +291,7 @@ def _register_shapes() -> None:
         return losses, voxels.new_empty(voxels.shape), voxels.new_empty(rays, 3), voxels.new_empty(rays)
 
     @fake("torch_surfcap::integration_ranges")
-    def _(voxels, table, frame, origins, directions):  # type: ignore[no-untyped-def]
+    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
         count = torch.library.get_ctx().new_dynamic_size()
         return origins.new_empty(origins.shape[0] + 1, dtype=torch.int64), origins.new_empty(count, 2)
 

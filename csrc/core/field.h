@@ -14,11 +14,7 @@ constexpr int kTileVoxels = kTile * kTile * kTile;  // [x][y][z], z fastest
 constexpr int kInside = -1;                         // table entry: solid, no tile
 constexpr int kOutside = -2;  // table entry: empty, no tile; kOutside - d: and so is every cell nearer than d cells
 
-#if defined(__AVX512F__) || !defined(__AVX2__)
-constexpr int kLanes = 16;  // samples set up together
-#else
-constexpr int kLanes = 8;
-#endif
+constexpr int kLanes = 8;  // samples set up together
 
 // Where kLanes points read the store: for each of the 8 corners (bit 2 = x, bit 1 = y, bit 0 = z) a voxel's index,
 // negative where there is no tile, and its trilinear weight.
@@ -58,6 +54,23 @@ SURFCAP_HD void locate(const Field<Real>& field, const Pack<Real, kLanes> (&u)[3
     store<int32_t, kLanes>(out.voxel[c], larger_pack<int32_t, kLanes>(t, voxel));
     store<Real, kLanes>(out.weight[c], weight[0][cx] * weight[1][cy] * weight[2][cz]);
   }
+}
+
+// Asks for the records that the first `count` lanes will read from, or add to, `records`. On CUDA the many threads of a
+// multiprocessor hide the wait instead.
+template <class Real, int Degree>
+SURFCAP_HD void prefetch(const Real* records, const Footprints<Real>& at, int count) {
+#if !defined(__CUDACC__)
+  using R = Record<Degree>;
+  constexpr int kLine = 64 / sizeof(Real);
+  // Small records of one column along z share a cache line most of the time.
+  constexpr int kStride = R::kPitch * 2 <= kLine ? 2 : 1;
+  for (int l = 0; l < count; ++l)
+    for (int c = 0; c < 8; c += kStride) {
+      const int32_t voxel = larger(at.voxel[c][l], 0);
+      for (int i = 0; i < R::kPitch; i += kLine) __builtin_prefetch(records + int64_t(voxel) * R::kPitch + i);
+    }
+#endif
 }
 
 // The trilinear read of lane l: sum of weight times record over the 8 corners. A missing corner is black and has the

@@ -68,26 +68,6 @@ template <class Real> class Cells {
   Pack<int32_t, 4> last_cell_, forward_;  // forward: 1 where the ray runs up the axis
 };
 
-// Integration ranges (paper, section 4.1): the stretches [begin, end) of a ray that lie in non-empty cells, neighbours
-// joined. Writes them where `out` is given and returns their number.
-template <class Real> SURFCAP_HD int integration_ranges(const Cells<Real>& cells, Real voxel, Real* out) {
-  int count = 0;
-  bool open = false;
-  Real t = cells.near;
-  while (t < cells.far) {
-    Real leave;
-    const bool empty = cells.empty(t, leave);
-    if (!empty && !open) {
-      if (out) out[2 * count] = t;
-      ++count;
-    }
-    open = !empty;
-    t = larger(leave, t) + Real(1e-3) * voxel;  // a hair past the border, so that the next look is beyond it
-    if (out && open) out[2 * count - 1] = smaller(t, cells.far);
-  }
-  return count;
-}
-
 // Hands out, front to back, the indices k of the samples in non-empty cells: by looking at the cells, or from the ray's
 // integration ranges where they are known.
 template <class Real> class Lattice {

@@ -15,7 +15,7 @@ inline namespace SURFCAP_ISA {
 
 // What the walk back needs of a sample.
 template <class Real, class Opacity> struct Sample {
-  Pack<Real, 4> color;  // lane 0 unused, then r, g, b, as composited
+  Pack<Real, 4> color;  // the field's opacity value here, then r, g, b as composited
   Real t, a, transmittance;
   typename Opacity::State before, now;
   bool starts_run;
@@ -42,11 +42,12 @@ template <class Real> SURFCAP_HD int64_t trace_capacity(const Field<Real>& field
   return (longest / kLanes + 2) * kLanes;
 }
 
+// `gradient`, where given, is what the walk back will add to: it is fetched meanwhile.
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD RayResult<Real> walk_forward(const Field<Real>& field, const Real* missing_records, const Line<Real>& line,
                                         const Coefficients<Real, Degree>& weights, const RaySettings<Real>& settings,
                                         Lattice<Real> lattice, const Opacity& opacity,
-                                        const Trace<Real, Opacity>& trace) {
+                                        const Trace<Real, Opacity>& trace, const Real* gradient) {
   RayResult<Real> ray{zero_pack<Real, 4>(), Real(1), Real(0), 0};
   typename Opacity::State before = opacity.outside();
   Pack<Real, 4> color_before = zero_pack<Real, 4>();
@@ -62,6 +63,8 @@ SURFCAP_HD RayResult<Real> walk_forward(const Field<Real>& field, const Real* mi
     for (int axis = 0; axis < 3; ++axis) u[axis] = line.origin[axis] + t * line.direction[axis];
     Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
     locate(field, u, at);
+    prefetch<Real, Degree>(field.voxels, at, count);
+    if (gradient) prefetch<Real, Degree>(gradient, at, count);
     for (int l = 0; l < count; ++l) {
       Pack<Real, 4> color = fold<Real, Degree>(interpolate<Real, Degree>(field, missing_records, at, l), weights);
       Sample<Real, Opacity>& sample = trace.samples[ray.samples++];
@@ -75,11 +78,12 @@ SURFCAP_HD RayResult<Real> walk_forward(const Field<Real>& field, const Real* mi
       if constexpr (Opacity::kMidpointColor) {
         const Pack<Real, 4> here = color;
         if (!sample.starts_run) color = Real(0.5) * (here + color_before);
+        color[0] = here[0];
         color_before = here;
       }
       sample.color = color;
       const Real w = (Real(1) - sample.a) * ray.transmittance;
-      color[0] = t[l];
+      color[0] = t[l];  // the sum's first lane is the depth's
       ray.sum += w * color;
       ray.opacity += w;
       ray.transmittance *= sample.a;

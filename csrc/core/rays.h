@@ -36,14 +36,15 @@ template <class Real, int Degree, class Opacity> struct Marcher {
   }
 
   SURFCAP_HD RayResult<Real> forward(const Rays<Real>& rays, int64_t i,
-                                     const Coefficients<Real, Degree>& weights) const {
+                                     const Coefficients<Real, Degree>& weights,
+                                     const Real* gradient = nullptr) const {
     const Line<Real> line(field, rays.origins + 3 * i, rays.directions + 3 * i);
     const Cells<Real> cells(field, line);
     const int64_t first = rays.ranges ? rays.range_offsets[i] : 0;
     const Lattice<Real> lattice(cells, settings.step, rays.shift[i], rays.ranges ? rays.ranges + 2 * first : nullptr,
                                 rays.ranges ? int32_t(rays.range_offsets[i + 1] - first) : 0);
     return walk_forward<Real, Degree, Opacity>(field, missing_records, line, weights, settings, lattice, opacity,
-                                               trace);
+                                               trace, gradient);
   }
 };
 
@@ -64,7 +65,7 @@ SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march,
                                     const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth,
                                     Real* gradient, Real* spare) {
   const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
-  const RayResult<Real> ray = march.forward(rays, i, weights);
+  const RayResult<Real> ray = march.forward(rays, i, weights, gradient);
   // depth D = S/O with S = sum w t and O = sum w: dD = (t - D)/O per unit of w. Empty rays have no depth to pull on.
   const bool solid = ray.opacity > Real(0);
   const Real by_depth = solid ? grad_depth[i] / ray.opacity : Real(0);
@@ -85,7 +86,7 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
                                 const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t i,
                                 double* losses, Real* color, Real* transmittance, Real* gradient, Real* spare) {
   const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
-  const RayResult<Real> ray = march.forward(rays, i, weights);
+  const RayResult<Real> ray = march.forward(rays, i, weights, gradient);
   const Pack<Real, 4> target = color_of(seen.target + 3 * i), background = color_of(rays.background + 3 * i);
   const Pack<Real, 4> rendered = ray.sum + ray.transmittance * background;
   const Real weight = seen.weight[i];
@@ -116,6 +117,30 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
   losses[0] += double(weight * photo);
   losses[1] += double(weight * sample_loss);
   losses[2] += double(weight * excess * excess);
+}
+
+// Integration ranges (paper, section 4.1) of ray i: the stretches [begin, end) of distance that are not as good as empty,
+// a step wider on either side than the samples whose value is under `quiet`, and two steps beyond where the ray ends.
+// Writes them to `out`, which has room for one per sample, and returns their number.
+template <class Real, int Degree, class Opacity>
+SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real quiet,
+                          Real* out) {
+  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
+  const RayResult<Real> ray = march.forward(rays, i, weights);
+  const Real step = march.settings.step;
+  int count = 0;
+  Real end = Real(-1);
+  for (int k = 0; k < ray.samples; ++k) {
+    const Sample<Real, Opacity>& sample = march.trace.samples[k];
+    if (!(sample.color[0] < quiet)) continue;
+    if (sample.t - step > end) {
+      out[2 * count] = sample.t - step;
+      ++count;
+    }
+    end = sample.t + (k + 1 < ray.samples ? Real(1) : Real(3)) * step;
+    out[2 * count - 1] = end;
+  }
+  return count;
 }
 
 // Raises, at every voxel that a sample of ray i reads with a positive weight, seen[0] to T_k and seen[1] to w_k.

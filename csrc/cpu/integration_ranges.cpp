@@ -1,4 +1,4 @@
-// integration_ranges: the stretches of rays that pass non-empty cells.
+// integration_ranges: the stretches of rays that are worth sampling.
 #include <tuple>
 
 #include "parallel.h"
@@ -8,28 +8,34 @@ namespace surfcap {
 template <class Real>
 std::tuple<Tensor, Tensor> integration_ranges_typed(const Tensor& voxels, const Tensor& table,
                                                     const std::vector<double>& frame, const Tensor& origins,
-                                                    const Tensor& directions) {
+                                                    const Tensor& directions, const Tensor& shift, int64_t opacity,
+                                                    double slope, double step, double stop, double quiet) {
   const FieldArgument<Real> field(voxels, table, frame);
-  const Input<Real> from("origins", origins, {kAny, 3}), along("directions", directions, {origins.size(0), 3});
-  Rays<Real> rays{from.data(), along.data(), nullptr, nullptr, origins.size(0), nullptr, nullptr};
-  const Tensor offsets = torch::stable::new_zeros(origins, {rays.count + 1}, ScalarType::Long);
+  const RaysArgument<Real> rays(origins, directions, shift, origins);  // no background is read
+  const RaySettings<Real> settings = ray_settings<Real>(opacity, slope, step, stop);
+  const int64_t count = rays.view.count;
+  const Tensor offsets = torch::stable::new_zeros(origins, {count + 1}, ScalarType::Long);
   int64_t* const starts = offsets.template mutable_data_ptr<int64_t>();
-  const auto for_rays = [&](int64_t* counts, Real* ranges) {
-    parallel_ranges(rays.count, kChunk, [&](int64_t begin, int64_t end) {
-      best_kernels<Real>().integration_ranges(field.view, rays, begin, end, counts, ranges);
-    });
-  };
-  for_rays(starts + 1, nullptr);
-  for (int64_t i = 0; i < rays.count; ++i) starts[i + 1] += starts[i];
-  rays.range_offsets = starts;
-  const Tensor ranges = torch::stable::new_empty(origins, {starts[rays.count], 2});
-  for_rays(nullptr, ranges.template mutable_data_ptr<Real>());
+  // One walk: every block of rays collects its ranges, which are then laid end to end.
+  const int64_t blocks = (count + kChunk - 1) / kChunk;
+  std::vector<std::vector<Real>> found(blocks);
+  parallel_ranges(blocks, 1, [&](int64_t first, int64_t last) {
+    for (int64_t b = first; b < last; ++b)
+      best_kernels<Real>().integration_ranges(field.view, rays.view, settings, Real(quiet), b * kChunk,
+                                              std::min(count, (b + 1) * kChunk), starts + 1, found[b]);
+  });
+  for (int64_t i = 0; i < count; ++i) starts[i + 1] += starts[i];
+  const Tensor ranges = torch::stable::new_empty(origins, {starts[count], 2});
+  Real* to = ranges.template mutable_data_ptr<Real>();
+  for (const auto& block : found) to = std::copy(block.begin(), block.end(), to);
   return {offsets, ranges};
 }
 
 std::tuple<Tensor, Tensor> integration_ranges(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins,
-                                              Tensor directions) {
-  return SURFCAP_BY_TYPE(voxels, integration_ranges_typed, voxels, table, frame, origins, directions);
+                                              Tensor directions, Tensor shift, int64_t opacity, double slope,
+                                              double step, double stop, double quiet) {
+  return SURFCAP_BY_TYPE(voxels, integration_ranges_typed, voxels, table, frame, origins, directions, shift, opacity,
+                         slope, step, stop, quiet);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("integration_ranges", TORCH_BOX(&integration_ranges)); }

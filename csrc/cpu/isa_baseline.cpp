@@ -5,6 +5,7 @@
 #include <cstdlib>
 #include <new>
 #include <type_traits>
+#include <vector>
 
 #define SURFCAP_ISA baseline
 #define SURFCAP_ISA_NAME "baseline"

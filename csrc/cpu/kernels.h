@@ -2,6 +2,8 @@
 // drivers beside this file split the work over threads.
 #pragma once
 
+#include <vector>
+
 #include "../core/views.h"
 
 namespace surfcap {
@@ -19,9 +21,9 @@ template <class Real> struct Kernels {
   void (*photometric_step)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, const Observation<Real>&,
                            const PhotometricSettings<Real>&, int64_t begin, int64_t end, double* losses, Real* color,
                            Real* transmittance, Real* gradient);
-  // Counts the ranges of each ray where `ranges` is null, else writes them from range_offsets on.
-  void (*integration_ranges)(const Field<Real>&, const Rays<Real>&, int64_t begin, int64_t end, int64_t* counts,
-                             Real* ranges);
+  // Appends the ranges of each ray to `ranges` and writes their number to counts[ray].
+  void (*integration_ranges)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, Real quiet, int64_t begin,
+                             int64_t end, int64_t* counts, std::vector<Real>& ranges);
   void (*visibility)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, int64_t begin, int64_t end,
                      Real* seen);
   void (*voxel_terms)(const Field<Real>&, const int32_t* coordinates, const VoxelTerms<Real>&, int64_t begin,

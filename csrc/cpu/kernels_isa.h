@@ -90,15 +90,15 @@ void photometric_step(const Field<Real>& field, const Rays<Real>& rays, const Ra
 }
 
 template <class Real>
-void integration_ranges(const Field<Real>& field, const Rays<Real>& rays, int64_t begin, int64_t end, int64_t* counts,
-                        Real* ranges) {
-  for (int64_t i = begin; i < end; ++i) {
-    const Line<Real> line(field, rays.origins + 3 * i, rays.directions + 3 * i);
-    const Cells<Real> cells(field, line);
-    Real* const out = ranges ? ranges + 2 * rays.range_offsets[i] : nullptr;
-    const int count = integration_ranges(cells, Real(1) / field.per_unit, out);
-    if (counts) counts[i] = count;
-  }
+void integration_ranges(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, Real quiet,
+                        int64_t begin, int64_t end, int64_t* counts, std::vector<Real>& ranges) {
+  std::vector<Real> room(2 * trace_capacity(field, settings.step));
+  with_marcher(field, settings, [&](const auto& march) {
+    for (int64_t i = begin; i < end; ++i) {
+      counts[i] = ray_ranges(march, rays, i, quiet, room.data());
+      ranges.insert(ranges.end(), room.data(), room.data() + 2 * counts[i]);
+    }
+  });
 }
 
 template <class Real>
@@ -114,12 +114,15 @@ template <class Real, class Point, class F>
 void for_points(const Field<Real>& field, int64_t begin, int64_t end, const Point& point, const F& f) {
   for (int64_t first = begin; first < end; first += kLanes) {
     const int count = int(end - first < kLanes ? end - first : kLanes);
-    Pack<Real, kLanes> u[3];
+    Real x[3][kLanes];
     for (int l = 0; l < kLanes; ++l) {
-      Real x[3];
-      point(first + (l < count ? l : 0), x);
-      for (int axis = 0; axis < 3; ++axis) u[axis][l] = (x[axis] - field.origin[axis]) * field.per_unit - Real(0.5);
+      Real at[3];
+      point(first + (l < count ? l : 0), at);
+      for (int axis = 0; axis < 3; ++axis) x[axis][l] = at[axis];
     }
+    Pack<Real, kLanes> u[3];
+    for (int axis = 0; axis < 3; ++axis)
+      u[axis] = (load<Real, kLanes>(x[axis]) - field.origin[axis]) * field.per_unit - Real(0.5);
     Footprints<Real> at;
     locate(field, u, at);
     f(at, count, first);

@@ -4,6 +4,10 @@
 // number of groups, each with a buffer of its own, and the buffers are added in a fixed order.
 #pragma once
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 #include <algorithm>
 
 #include "../arguments.h"
@@ -12,6 +16,16 @@
 namespace surfcap {
 
 constexpr int64_t kChunk = 256;  // rays or points that one group takes at a time, to even out the load
+
+// Asks for large pages under a large, still untouched buffer: the march reads and writes it at random, and would
+// otherwise wait for address translation more than for data.
+inline void advise_large_pages(void* data, int64_t bytes) {
+#if defined(__linux__)
+  constexpr uintptr_t kPage = uintptr_t(2) << 20;
+  const uintptr_t begin = (uintptr_t(data) + kPage - 1) / kPage * kPage, end = (uintptr_t(data) + bytes) / kPage * kPage;
+  if (begin < end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
+#endif
+}
 
 template <class F> void parallel_ranges(int64_t count, int64_t grain, const F& f) {
   if (count > 0) torch::stable::parallel_for(0, count, grain, [&](int64_t begin, int64_t end) { f(begin, end); });
@@ -28,6 +42,8 @@ void grouped(const Tensor& like, int64_t count, int64_t groups, int64_t size, Re
   groups = std::max<int64_t>(1, std::min(groups, chunks));
   const Tensor rest = torch::stable::new_empty(like, {groups - 1, size});
   Real* const buffers = groups > 1 ? rest.template mutable_data_ptr<Real>() : nullptr;
+  advise_large_pages(total, size * int64_t(sizeof(Real)));
+  advise_large_pages(buffers, (groups - 1) * size * int64_t(sizeof(Real)));
   parallel_ranges(groups, 1, [&](int64_t first, int64_t last) {
     for (int64_t g = first; g < last; ++g) {
       Real* const buffer = g == 0 ? total : buffers + (g - 1) * size;

@@ -12,6 +12,7 @@ Tensor upscale_typed(const Tensor& voxels, const Tensor& table, const std::vecto
   const int64_t tiles = fine_coordinates.size(0);
   const Tensor out = torch::stable::new_empty(voxels, {tiles, kTileSide, kTileSide, kTileSide, coarse.view.pitch});
   Real* const values = out.template mutable_data_ptr<Real>();
+  advise_large_pages(values, out.numel() * int64_t(sizeof(Real)));
   parallel_ranges(tiles, 16, [&](int64_t begin, int64_t end) {
     best_kernels<Real>().upscale(coarse.view, fine, places.data(), begin, end, values);
   });

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -65,8 +67,8 @@ def grown(mask: Tensor, pixels: int) -> Tensor:
     """Maximum of a mask [H, W] over squares that reach ``pixels`` far."""
     if pixels <= 0:
         return mask
-    side = 2 * pixels + 1
-    return torch.nn.functional.max_pool2d(mask[None, None], side, stride=1, padding=pixels)[0, 0]
+    square = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
+    return torch.from_numpy(cv2.dilate(mask.numpy(), square))
 
 
 def find_box(capture: Capture) -> tuple[Tensor, Tensor]:

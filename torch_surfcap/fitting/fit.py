@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from torch_surfcap import ops
+from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.field import MISSING, SLOPE, SurfaceField
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.levels import Level, first_field, next_level, plan_levels, subject_box
-from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, gather_rays
+from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, find_ranges, gather_rays
 from torch_surfcap.fitting.settings import FitSettings
 
 if TYPE_CHECKING:
@@ -64,10 +65,11 @@ def fit(capture: Capture, progress: Progress | None = None, **settings: Any) -> 
             grid, store = first_field(pictures[level.halvings], box, level.voxel_size, s.opacity, degree)
         else:
             grid, store = next_level(grid, store, s.opacity, rays, s.descent.step * 2 * level.voxel_size, s.descent.stop)
-        rays = gather_rays(pictures[level.halvings], store, grid, grid.frame(*MISSING[s.opacity]), backdrop)
-        spent = {"prepare": time.perf_counter() - begin, "march": 0.0, "voxels": 0.0, "adam": 0.0}
         last = number == len(plan) - 1
-        for row in descend(store, grid, rays, s, level, last, generator, spent):
+        march = March(ops.OPACITY[s.opacity], SLOPE, (s.descent.last_step if last else s.descent.step) * level.voxel_size, s.descent.stop)
+        rays = gather_rays(pictures[level.halvings], store, grid, s.opacity, march, backdrop)
+        spent = {"prepare": time.perf_counter() - begin, "march": 0.0, "voxels": 0.0, "adam": 0.0}
+        for row in descend(store, grid, rays, s, level, march, generator, spent):
             row["level"] = number
             history.append(row)
             if progress:
@@ -82,17 +84,22 @@ def fit(capture: Capture, progress: Progress | None = None, **settings: Any) -> 
     return FitResult(result, mesh, history, torch.ones(views, 3), torch.zeros(views, 3), {}, seconds, [])
 
 
-def descend(store, grid, rays, s, level, last, generator, spent):
+REFRESH = 8  # iterations after which the integration ranges are found anew
+
+
+def descend(store, grid, rays, s, level, march, generator, spent):
     frame = grid.frame(*MISSING[s.opacity])
     adam = TileAdam(store, s.opacity, s.descent)
     loss = s.losses
-    step = (s.descent.last_step if last else s.descent.step) * level.voxel_size
     groups = max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * store.numel())))
-    march = (ops.OPACITY[s.opacity], SLOPE, step, s.descent.stop)
     ray_weights = [loss.photo, loss.sample, loss.mask]
     voxel_weights = [loss.tv_opacity, loss.tv_color, loss.parsimony, loss.ballooning]
     for i in range(level.iterations):
         t0 = time.perf_counter()
+        if i and i % REFRESH == 0:
+            rays.ranges = find_ranges(store, grid, s.opacity, march, rays.origins, rays.directions)
+            spent['ranges'] = spent.get('ranges', 0) + time.perf_counter() - t0
+            t0 = time.perf_counter()
         adam.scale = RATE_DECAY ** (i / level.iterations)
         shift = (torch.rand(len(rays), generator=generator) - 0.5) * s.descent.jitter
         ray_losses, gradient, _, _ = ops.photometric_step(

@@ -20,7 +20,7 @@ ITERATIONS = (60, 40, 30, 20)  # from the fourth-finest level to the finest: a s
 SMALLEST_IMAGE = 32  # pixels along the shorter side of the coarsest pictures
 MARGIN = 2  # coarse voxels around the subject's box
 FOG = 0.98  # transparency that the hull is filled with
-BAND = 1.5  # voxels on either side of a signed distance's zero that the next level follows
+BAND = 0.5  # voxels on either side of a signed distance's zero that the next level follows, with a margin of one
 SEEN = 0.02  # largest weight above which a voxel belongs to the surface; largest transmittance under which it is solid
 
 

@@ -8,12 +8,15 @@ import torch
 from torch import Tensor
 
 from torch_surfcap import ops
+from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.field.field import MISSING
 from torch_surfcap.field.hull import grown
 from torch_surfcap.field.tiles import TileGrid
 
 BLOCK = 8  # rays are ordered in blocks of so many pixels a side, so that neighbours read the same tiles
-MARGIN = 10  # voxels that stored tiles can reach beyond the silhouette
+QUIET = {"transparency": 0.999, "distance": 2.0}  # opacity value above which space is as good as empty
+MARGIN = 4  # voxels beyond the silhouette that rays are followed
 
 
 @dataclass
@@ -37,8 +40,10 @@ class RayBatch:
         return len(self.mask)
 
 
-def gather_rays(capture: Capture, store: Tensor, grid: TileGrid, frame: list[float], backdrop: Tensor | None) -> RayBatch:
-    """The rays of all cameras that pass a non-empty cell of ``grid`` (the others are culled).
+def gather_rays(
+    capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March, backdrop: Tensor | None
+) -> RayBatch:
+    """The rays of all cameras that meet anything in the field (the others are culled).
 
     The weight of a ray is 1/(number of views * rho), rho = (voxel * focal / distance)^2 being the pixels that a voxel's
     face covers: the gradient on a voxel then depends neither on the number of cameras nor on the image size nor on the
@@ -61,7 +66,7 @@ def gather_rays(capture: Capture, store: Tensor, grid: TileGrid, frame: list[flo
         reach = int(torch.ceil(MARGIN * pixels_per_voxel[i])) + 1
         index = _blocked((grown(mask, reach) > 0).nonzero())
         origins, directions = (r.float().contiguous() for r in cameras.rays(i, index.flip(1).double() + 0.5))
-        offsets, stretches = ops.integration_ranges(store, grid.table, frame, origins, directions)
+        offsets, stretches = find_ranges(store, grid, opacity, march, origins, directions)
         passes = offsets.diff()
         hit = passes > 0
         index, origins, directions = index[hit], origins[hit], directions[hit]
@@ -81,6 +86,14 @@ def gather_rays(capture: Capture, store: Tensor, grid: TileGrid, frame: list[flo
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
     origins, directions, target, background, soft, weight = joined
     return RayBatch(origins, directions, target, background, soft, weight, (offsets, torch.cat(ranges)), starts)
+
+
+def find_ranges(
+    store: Tensor, grid: TileGrid, opacity: str, march: March, origins: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The integration ranges of rays in the field as it now is: see ``ops.integration_ranges``."""
+    frame, shift = grid.frame(*MISSING[opacity]), origins.new_zeros(len(origins))
+    return ops.integration_ranges(store, grid.table, frame, origins, directions, shift, *march, QUIET[opacity])
 
 
 def _blocked(index: Tensor) -> Tensor:
