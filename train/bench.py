@@ -272,7 +272,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, help="markdown file to write")
     parser.add_argument("--pixels", type=int, default=48, help="along an edge of each camera's picture")
-    parser.add_argument("--cameras", type=int, default=24)
+    parser.add_argument("--cameras", type=int, default=60)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--degree", type=int, default=1, help=argparse.SUPPRESS)
     parser.add_argument("--peak", choices=("nothing", "fused", "torch"), help=argparse.SUPPRESS)
