@@ -49,22 +49,24 @@ def plate_silhouette(photograph: Picture, plate: Picture) -> Plane:
     factor = np.clip(product / np.maximum(square, 1e-6), *SHADOW)
     unshadowed = cv2.boxFilter(_deviation(P - factor[:, :, None] * B, like=difference), -1, (5, 5))
     subject = (score > PLATE_SIGMAS) & (unshadowed > SHADOW_SIGMAS)
-    return _soft_edge(
-        _cleaned(_closed(subject.astype(np.uint8)), keep=0.02), _smooth(np.abs(difference).mean(axis=2), 0.5)
-    )
+    binary = _cleaned(_closed(subject.astype(np.uint8)), keep=0.02)
+    # smoothing made it fat by a pixel or two: there a pixel must differ by itself
+    fat = (binary > 0) & (cv2.erode(binary, np.ones((5, 5), np.uint8)) == 0)
+    binary[fat & (_deviation(difference, blur=0.3) < PLATE_SIGMAS / 2)] = 0
+    return _soft_edge(_cleaned(binary, keep=0.02), _smooth(np.abs(difference).mean(axis=2), 0.5))
 
 
 def _smooth(values: Plane, sigma: float) -> Plane:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma), dtype=np.float32)
 
 
-def _deviation(difference: Plane, like: Plane | None = None) -> Plane:
+def _deviation(difference: Plane, like: Plane | None = None, blur: float = 1.0) -> Plane:
     """[H,W] how many noise deviations a difference picture [H,W,3] is away from zero, averaged over its neighbours.
 
     Photographs are noisy and subjects are larger than a pixel. The noise is that of `like`, by default itself.
     """
-    smooth = _smooth(difference, 1.0)
-    noise = smooth if like is None else _smooth(like, 1.0)
+    smooth = _smooth(difference, blur)
+    noise = smooth if like is None else _smooth(like, blur)
     sigma = np.maximum(1.4826 * np.median(np.abs(noise), axis=(0, 1)), PLATE_FLOOR / PLATE_SIGMAS)
     return np.sqrt(((smooth / sigma) ** 2).mean(axis=2))
 
