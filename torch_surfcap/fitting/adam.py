@@ -14,23 +14,19 @@ BOUNDS = {"transparency": (ETA, 1.0), "distance": (-CLAMP, CLAMP)}
 
 
 class TileAdam:
-    """Adam with a rate and bounds per coefficient, on padded records [T, 4, 4, 4, P], in place.
-
-    The rates are those of the settings times ``scale``, which the schedule lowers.
-    """
+    """Adam with a rate and bounds per coefficient, on padded records [T, 4, 4, 4, P], in place."""
 
     def __init__(self, store: Tensor, opacity: str, descent: Descent) -> None:
         self.store = store
         self.first, self.second = torch.zeros_like(store), torch.zeros_like(store)
         self.t = 0
-        self.scale = 1.0
         count = ops.coefficients(ops.degree_of(store.shape[-1]))
         self.rate, self.low, self.high = (store.new_zeros(store.shape[-1]) for _ in range(3))
         bounds = ((slice(0, 1), descent.rate_opacity, BOUNDS[opacity]), (slice(1, 4), descent.rate_color, (0.0, 1.0)))
         for part, rate, (low, high) in (*bounds, (slice(4, count), descent.rate_view, (-1.0, 1.0))):
             self.rate[part], self.low[part], self.high[part] = rate, low, high
 
-    def step(self, gradient: Tensor) -> None:
+    def step(self, gradient: Tensor, scale: float = 1.0) -> None:
+        """One step with the settings' rates times ``scale``."""
         self.t += 1
-        rate = self.rate * self.scale
-        ops.adam_step(self.store, gradient, self.first, self.second, rate, self.low, self.high, self.t)
+        ops.adam_step(self.store, gradient, self.first, self.second, self.rate * scale, self.low, self.high, self.t)

@@ -1,8 +1,7 @@
-"""The fit: from a capture to a field and a mesh."""
+"""The fit: from a capture to a field and a mesh, level by level."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -13,24 +12,27 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
-from torch_surfcap.field.field import MISSING, SLOPE, SurfaceField
-from torch_surfcap.field.tiles import TileGrid
-from torch_surfcap.fitting.adam import TileAdam
+from torch_surfcap.errors import InputError
+from torch_surfcap.field.field import SLOPE, SurfaceField
+from torch_surfcap.fitting.budget import Budget, estimate, shortage
+from torch_surfcap.fitting.descent import Stopwatch, descend
 from torch_surfcap.fitting.levels import Level, first_field, next_level, plan_levels, subject_box
-from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, find_ranges, gather_rays
+from torch_surfcap.fitting.rays import choose_backdrop, gather_rays
 from torch_surfcap.fitting.settings import FitSettings
 
 if TYPE_CHECKING:
     import trimesh
 
-RATE_DECAY = 0.1  # of the learning rates over a level's iterations
-GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
-GROUPS = (4, 32)
+DEFAULT_DEGREE = 1
 
 
 @dataclass
 class FitResult:
-    """field, mesh; history: one row per iteration; gain, bias [N, 3] per camera; chosen: what the program chose."""
+    """What a fit gives.
+
+    field, mesh: the surface. history: one row per iteration, with its level. gain, bias: [N, 3] per camera.
+    chosen: what the program chose and why. seconds: per stage and level. warnings: one sentence each.
+    """
 
     field: SurfaceField
     mesh: trimesh.Trimesh
@@ -42,75 +44,91 @@ class FitResult:
     warnings: list[str] = field(default_factory=list)
 
 
-Progress = Callable[[int, Level, int, dict[str, float]], None]
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit is: level ``number`` (from 0) of ``levels``, its ``voxels``, and the row of history just finished;
+    before the first level, ``row`` is empty and ``budget`` says what the fit will need."""
+
+    number: int
+    levels: int
+    level: Level
+    voxels: int
+    row: dict[str, float]
+    budget: Budget | None = None
 
 
-def fit(capture: Capture, progress: Progress | None = None, **settings: Any) -> FitResult:
+def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **settings: Any) -> FitResult:
+    """Fit a field to the photographs of a capture and take its mesh.
+
+    Args:
+        capture: its training views; held-out views are never looked at.
+        progress: called before the first level and after every iteration.
+        settings: see :class:`torch_surfcap.fitting.settings.FitSettings`.
+
+    Raises:
+        InputError: no silhouettes, no common view volume, an empty hull, no memory for even the first level.
+        TypeError, ValueError: unknown or impossible settings.
+
+    >>> import torch_surfcap as sc
+    >>> result = sc.fit(sc.load_capture("capture"), sh_degree=0)  # doctest: +SKIP
+    >>> result.mesh.export("mesh.ply")  # doctest: +SKIP
+    """
     s = FitSettings.of(**settings)
-    start = time.perf_counter()
-    degree = 1 if s.sh_degree is None else s.sh_degree
+    report = progress or (lambda _: None)
+    if s.device != "cpu":
+        raise InputError(f"device: found {s.device}, expected cpu: this build has no CUDA kernels")
+    seconds: dict[str, Any] = {}
+    watch = Stopwatch(seconds)
+    degree = DEFAULT_DEGREE if s.sh_degree is None else s.sh_degree
     box = subject_box(capture, s.box)
     plan = plan_levels(capture, box, s.voxel, s.levels)
     pictures = [capture]
     while len(pictures) <= plan[0].halvings:
         pictures.append(pictures[-1].halved())
+    # With plates the picture itself is explained; with masks alone the subject is set before one colour.
     backdrop = None if capture.mask_source == "plate" else choose_backdrop(capture)
-    seconds: dict[str, Any] = {"hull": time.perf_counter() - start, "levels": []}
+    grid, store = first_field(pictures[plan[0].halvings], box, plan[0].voxel_size, s.opacity, degree)
+    watch.lap("hull")
+    budget = estimate(capture, plan, grid, store)
+    report(Progress(0, len(plan), plan[0], 0, {}, budget))
+
     history: list[dict[str, float]] = []
+    warnings = list(capture.warnings)
+    by_level: list[dict[str, float]] = []
     generator = torch.Generator().manual_seed(s.seed)
-    grid, store, rays = None, None, None
+    rays = None
     for number, level in enumerate(plan):
-        begin = time.perf_counter()
-        if grid is None:
-            grid, store = first_field(pictures[level.halvings], box, level.voxel_size, s.opacity, degree)
-        else:
-            grid, store = next_level(grid, store, s.opacity, rays, s.descent.step * 2 * level.voxel_size, s.descent.stop)
-        last = number == len(plan) - 1
-        march = March(ops.OPACITY[s.opacity], SLOPE, (s.descent.last_step if last else s.descent.step) * level.voxel_size, s.descent.stop)
+        missing = shortage(budget.level_bytes[number])
+        if missing:
+            sentence = f"level {number + 1} of {len(plan)} (voxels of {level.voxel_size:.4g}) {missing}"
+            if number == 0:
+                raise InputError(f"memory: {sentence}")
+            warnings.append(f"{sentence}; the fit ends with the level before")
+            break
+        spent: dict[str, float] = {}
+        level_watch = Stopwatch(spent)
+        step = s.descent.last_step if number == len(plan) - 1 else s.descent.step
+        march = March(ops.OPACITY[s.opacity], SLOPE, step * level.voxel_size, s.descent.stop)
+        if rays is not None:
+            grid, store = next_level(grid, store, s.opacity, rays, 2 * march.step, march.stop)
         rays = gather_rays(pictures[level.halvings], store, grid, s.opacity, march, backdrop)
-        spent = {"prepare": time.perf_counter() - begin, "march": 0.0, "voxels": 0.0, "adam": 0.0}
-        for row in descend(store, grid, rays, s, level, march, generator, spent):
-            row["level"] = number
-            history.append(row)
-            if progress:
-                progress(number, level, len(store) * 64, row)
-        seconds["levels"].append(spent)
-    begin = time.perf_counter()
-    result = SurfaceField(store, grid, s.opacity)
-    mesh = result.extract_mesh(s.threshold, s.smooth, s.specks)
-    seconds["mesh"] = time.perf_counter() - begin
-    seconds["total"] = time.perf_counter() - start
-    views = len(capture)
-    return FitResult(result, mesh, history, torch.ones(views, 3), torch.zeros(views, 3), {}, seconds, [])
-
-
-REFRESH = 8  # iterations after which the integration ranges are found anew
-
-
-def descend(store, grid, rays, s, level, march, generator, spent):
-    frame = grid.frame(*MISSING[s.opacity])
-    adam = TileAdam(store, s.opacity, s.descent)
-    loss = s.losses
-    groups = max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * store.numel())))
-    ray_weights = [loss.photo, loss.sample, loss.mask]
-    voxel_weights = [loss.tv_opacity, loss.tv_color, loss.parsimony, loss.ballooning]
-    for i in range(level.iterations):
-        t0 = time.perf_counter()
-        if i and i % REFRESH == 0:
-            rays.ranges = find_ranges(store, grid, s.opacity, march, rays.origins, rays.directions)
-            spent['ranges'] = spent.get('ranges', 0) + time.perf_counter() - t0
-            t0 = time.perf_counter()
-        adam.scale = RATE_DECAY ** (i / level.iterations)
-        shift = (torch.rand(len(rays), generator=generator) - 0.5) * s.descent.jitter
-        ray_losses, gradient, _, _ = ops.photometric_step(
-            store, grid.table, frame, rays.origins, rays.directions, shift, rays.background, rays.target, rays.mask,
-            rays.weight, *march, loss.huber, ray_weights, loss.detach_sample, groups, rays.ranges,
-        )
-        t1 = time.perf_counter()
-        voxel_losses = ops.voxel_terms(store, grid.table, frame, grid.places, voxel_weights, 0.1, gradient)
-        t2 = time.perf_counter()
-        adam.step(gradient)
-        t3 = time.perf_counter()
-        spent["march"] += t1 - t0; spent["voxels"] += t2 - t1; spent["adam"] += t3 - t2
-        yield {"iteration": i, "photo": float(ray_losses[0]), "sample": float(ray_losses[1]), "mask": float(ray_losses[2]),
-            "loss": float(ray_losses @ ray_losses.new_tensor(ray_weights) + voxel_losses @ voxel_losses.new_tensor(voxel_weights))}
+        level_watch.lap("prepare")
+        for row in descend(store, grid, rays, s, march, level.iterations, generator, spent):
+            history.append({"level": float(number)} | row)
+            report(Progress(number, len(plan), level, len(store) * ops.TILE**3, row))
+        by_level.append(spent)
+    watch.lap("fit")
+    surface = SurfaceField(store, grid, s.opacity)
+    mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
+    watch.lap("mesh")
+    if len(mesh.faces) == 0:
+        raise InputError("surface: the fit ended without any, expected a subject inside the silhouettes")
+    seconds["levels"] = by_level
+    identity = torch.ones(len(capture), 3)
+    chosen = {
+        "sh_degree": {"value": degree, "reason": "default" if s.sh_degree is None else "given"},
+        "voxel": {"value": plan[-1].voxel_size, "reason": "a pixel's footprint" if s.voxel is None else "given"},
+        "levels": {"value": len(plan), "reason": "size of the pictures" if s.levels is None else "given"},
+        "box": {"value": [*box[0].tolist(), *box[1].tolist()], "reason": "silhouettes" if s.box is None else "given"},
+    }
+    return FitResult(surface, mesh, history, identity, torch.zeros_like(identity), chosen, seconds, warnings)

@@ -1,0 +1,64 @@
+"""What a fit will need: memory per level, and a rough guess of the time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import psutil
+import torch
+from torch import Tensor
+
+from torch_surfcap import ops
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.descent import gradient_groups
+from torch_surfcap.fitting.levels import Level
+
+BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
+TILES_PER_AREA = 2.5  # stored tiles per tile face of surface, measured
+SAMPLES_PER_RAY = 7  # within the integration ranges, measured
+SAMPLE_SECONDS = {4: 60e-9, 16: 90e-9, 32: 130e-9}  # forward and backward on one core, by pitch, measured
+RAY_MARGIN = 1.3  # rays per pixel of the silhouettes
+
+
+@dataclass(frozen=True)
+class Budget:
+    """level_bytes: of each level's field, moments, gradients and rays. seconds: of the whole fit, within a factor of two."""
+
+    level_bytes: list[int]
+    seconds: float
+
+
+def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor) -> Budget:
+    """The budget of a fit whose first level has this grid: surfaces grow by 4 per level, and so do pictures."""
+    assert capture.masks is not None
+    pixels = sum(float(mask.sum()) for mask in capture.masks)
+    pitch = store.shape[-1]
+    area = _surface_tiles(grid, store)
+    level_bytes, samples = [], 0.0
+    for number, level in enumerate(plan):
+        tiles = len(store) if number == 0 else TILES_PER_AREA * area * 4**number
+        numbers = int(tiles * ops.TILE**3 * pitch)
+        rays = RAY_MARGIN * pixels / 4**level.halvings
+        level_bytes.append(int(4 * numbers * (3 + gradient_groups(numbers)) + BYTES_PER_RAY * rays))
+        samples += rays * level.iterations * SAMPLES_PER_RAY
+    return Budget(level_bytes, samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
+
+
+def shortage(needed: int) -> str | None:
+    """What is missing for so many bytes, and what would help; None where they are free."""
+    free = psutil.virtual_memory().available
+    if needed <= free:
+        return None
+    return (
+        f"needs {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: "
+        "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"
+    )
+
+
+def _surface_tiles(grid: TileGrid, store: Tensor) -> float:
+    """Area of the hull's surface in tile faces: faces between stored voxels inside and outside, a third too many."""
+    value = store[..., 0]
+    inside = value < (0.0 if float(value.max()) > 1.0 or float(value.min()) < 0.0 else 0.99)
+    faces = sum(float((inside.diff(dim=axis) != 0).sum()) for axis in (1, 2, 3))
+    return faces * 4 / 3 / 1.5 / ops.TILE**2
