@@ -34,8 +34,8 @@ class Capture:
     names:           N unique names, "000", "001", ... by default
 
     Attributes: .images (list, uint8 or float32), .masks (list of float32, or None until `prepare`), .plates (list or
-    None), .names, .cameras, .mask_source ("file", "alpha", "plate", "threshold" or None), .warnings (one sentence
-    each), .test (the held-out views or None), .train (itself).
+    None), .names, .cameras, .mask_source ("file", "alpha", "plate", "threshold" or None), .format (of the calibration,
+    or "arrays"), .warnings (one sentence each), .test (the held-out views or None), .train (itself).
     Raises InputError where counts, sizes or calibrations do not hold.
 
     >>> import torch
@@ -90,6 +90,7 @@ class Capture:
                         f"{kind} of camera {name}: {size_text(other)}, expected the image's {size_text(image)}"
                     )
         self.cameras = as_cameras(K, world_to_camera, size, self.names)
+        self.format = "arrays"
         self.warnings: list[str] = []
         self.test: Capture | None = None
         self.prepared = False
@@ -154,7 +155,12 @@ class Capture:
         copy = object.__new__(Capture)
         copy.images, copy.masks, copy.plates = images, masks, plates
         copy.names, copy.cameras = names, cameras
-        copy.mask_source, copy.test, copy.prepared = self.mask_source, self.test, self.prepared
+        copy.format, copy.mask_source, copy.test, copy.prepared = (
+            self.format,
+            self.mask_source,
+            self.test,
+            self.prepared,
+        )
         copy.warnings = list(self.warnings)
         return copy
 
@@ -182,13 +188,14 @@ def load_capture(
     Masks are never None afterwards. Cameras that see nothing useful are left out and named in `.warnings`.
     Raises InputError (one line: file, found, expected) for anything that cannot be used.
     """
-    views = read_views(Path(path), format)
+    format, views = read_views(Path(path), format)
     named = any(view.held_out for view in views)
     if holdout and not named:
         for view in views[::holdout]:
             view.held_out = True
     views = without(views, skip)
     capture = _from_views([view for view in views if not view.held_out], scale, masks, plates)
+    capture.format = format
     if holdout and named:
         capture.warnings.append(f"holdout={holdout} is ignored: the capture itself names its held-out views")
     held_out = [view for view in views if view.held_out]

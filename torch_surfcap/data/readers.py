@@ -15,18 +15,18 @@ EXPECTED = (
 )
 
 
-def read_views(path: Path, format: str = "auto") -> list[View]:
-    """The views of a capture folder, or of the calibration file itself. Raises InputError with what was expected."""
+def read_views(path: Path, format: str = "auto") -> tuple[str, list[View]]:
+    """Format and views of a capture folder, or of the calibration file itself. Raises InputError with what was expected."""
     if format != "auto" and format not in FORMATS:
         raise InputError(f"format={format}, expected one of auto, {', '.join(FORMATS)}")
     if not path.exists():
         raise InputError(f"{path}: no such file or folder, expected a capture")
     wanted = FORMATS if format == "auto" else {format: FORMATS[format]}
-    for reader in wanted.values():
+    for name, reader in wanted.items():
         calibration = reader.find(path)
         if calibration is not None:
             views = reader.read(calibration)
             if not views:
                 raise InputError(f"{calibration}: no cameras, expected at least 3")
-            return views
+            return name, views
     raise InputError(f"{path}: no calibration found, expected {EXPECTED}")

@@ -13,6 +13,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,15 +66,13 @@ def make_sample_scene(
     except OSError as error:
         raise InputError(f"{folder}: cannot be written to ({error.strerror}), expected a folder") from error
     mesh = figure_mesh()
-    with atomic_write(folder / "gt.ply") as partial:
-        mesh.export(partial)
+    with atomic_write(folder / "gt.ply") as target:
+        mesh.export(target)
     rng = np.random.default_rng(seed)
+    _ = mesh.vertex_normals, mesh.ray  # made once, before the threads share the mesh
     for split, count in (("test", test_views), ("train", views)):
         cameras = sample_cameras(count, size, turn=float(rng.uniform(0, 2 * np.pi)))
-        in_threads(
-            lambda i, split=split, cameras=cameras: _write_view(folder, split, mesh, cameras, i, seed),
-            range(count),
-        )
+        in_threads(partial(_write_view, folder, split, mesh, cameras, seed), range(count))
         _write_transforms(folder / f"transforms_{split}.json", cameras, split, parameters)
     return folder
 
@@ -142,13 +141,13 @@ def _shaded(
     return np.clip(figure_colors(points, seed) * light[:, None], 0, 1)
 
 
-def _write_view(folder: Path, split: str, mesh: trimesh.Trimesh, cameras: Cameras, i: int, seed: int) -> None:
+def _write_view(folder: Path, split: str, mesh: trimesh.Trimesh, cameras: Cameras, seed: int, i: int) -> None:
     photograph, mask, plate = render_view(mesh, cameras, i, seed)
     names = _names(split, i)
     for name, picture in zip(names, (photograph, mask, plate), strict=True):
         pixels = np.round(255 * picture).astype(np.uint8)
-        with atomic_write(folder / name) as partial:
-            cv2.imwrite(str(partial), pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)
+        with atomic_write(folder / name) as target:
+            cv2.imwrite(str(target), pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)
 
 
 def _names(split: str, i: int) -> tuple[str, str, str]:
@@ -174,8 +173,8 @@ def _write_transforms(path: Path, cameras: Cameras, split: str, parameters: dict
         "h": int(size[1]),
         "frames": frames,
     }
-    with atomic_write(path) as partial:
-        partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    with atomic_write(path) as target:
+        target.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def _parameters(path: Path) -> Any:
