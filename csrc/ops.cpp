@@ -13,7 +13,7 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
   m.def("march_backward(Tensor grad_color, Tensor grad_transmittance, Tensor grad_depth, " FIELD ", " RAYS ", " MARCH
         ", int groups) -> Tensor");
   m.def("photometric_step(" FIELD ", " RAYS ", Tensor target, Tensor mask, Tensor weight, "
-        "Tensor? range_offsets, Tensor? ranges, " MARCH ", float huber, float[] weights, bool detach_sample, int groups) -> (Tensor, Tensor, Tensor, Tensor)");
+        "Tensor? range_offsets, Tensor? ranges, " MARCH ", float huber, float[] weights, bool detach_sample, Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
   m.def("integration_ranges(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH
         ", float quiet) -> (Tensor, Tensor)");
   m.def("visibility(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH ", int groups) -> Tensor");

@@ -135,6 +135,7 @@ def photometric_step(
     detach_sample: bool = False,
     groups: int = GROUPS,
     ranges: tuple[Tensor, Tensor] | None = None,
+    gradients: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Value and gradient of the ray losses in one call.
 
@@ -145,6 +146,8 @@ def photometric_step(
             sum_k w_k Huber(c_k - target) (eq. 10, observed colour) and of the mask loss (T - (1 - mask))^2.
         detach_sample: the sample loss's w_k carry no gradient.
         ranges: of the rays, as :func:`integration_ranges` gives them; they save the search for non-empty cells.
+        gradients: [groups, T, 4, 4, 4, P], memory for the partial gradients; the first one receives the sum, which is what
+            is returned. Allocated where not given.
 
     Returns:
         losses [3] float64, not yet times ``weights``; the gradient of ``weights . losses`` [T, 4, 4, 4, P]; the colours
@@ -153,10 +156,10 @@ def photometric_step(
     field, rays, seen = (voxels, table, frame), (origins, directions, shift, background), (target, mask, weight)
     march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample)
     stretches = ranges or (None, None)
-    return cast(
-        "tuple[Tensor, Tensor, Tensor, Tensor]",
-        _ops.photometric_step(*field, *rays, *seen, *stretches, *march, *loss, groups),
-    )
+    if gradients is None:
+        gradients = voxels.new_empty(groups, *voxels.shape)
+    losses, color, transmittance = _ops.photometric_step(*field, *rays, *seen, *stretches, *march, *loss, gradients)
+    return losses, gradients[0], color, transmittance
 
 
 def integration_ranges(
@@ -288,7 +291,7 @@ def _register_shapes() -> None:
     def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
         rays = origins.shape[0]
         losses = voxels.new_empty(3, dtype=torch.float64)
-        return losses, voxels.new_empty(voxels.shape), voxels.new_empty(rays, 3), voxels.new_empty(rays)
+        return losses, voxels.new_empty(rays, 3), voxels.new_empty(rays)
 
     @fake("torch_surfcap::integration_ranges")
     def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]

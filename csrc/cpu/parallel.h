@@ -33,30 +33,38 @@ template <class F> void parallel_ranges(int64_t count, int64_t grain, const F& f
 
 
 // Calls work(begin, end, buffer, group) for all chunks of 0..count, chunk c in group c mod groups, each group with its
-// own zeroed buffer of `size` numbers, the first being `total`; then combines the buffers into `total` group by group.
+// own zeroed buffer of `size` numbers, the first being `total` and the others following one another in `rest`; then
+// combines the buffers into `total` group by group.
 template <class Real, class Work, class Combine>
-void grouped(const Tensor& like, int64_t count, int64_t groups, int64_t size, Real* total, const Work& work,
+void grouped(int64_t count, int64_t groups, int64_t size, Real* total, Real* rest, const Work& work,
              const Combine& combine) {
-  STD_TORCH_CHECK(groups >= 1, "groups: expected at least 1, got ", groups);
   const int64_t chunks = (count + kChunk - 1) / kChunk;
-  groups = std::max<int64_t>(1, std::min(groups, chunks));
-  const Tensor rest = torch::stable::new_empty(like, {groups - 1, size});
-  Real* const buffers = groups > 1 ? rest.template mutable_data_ptr<Real>() : nullptr;
-  advise_large_pages(total, size * int64_t(sizeof(Real)));
-  advise_large_pages(buffers, (groups - 1) * size * int64_t(sizeof(Real)));
   parallel_ranges(groups, 1, [&](int64_t first, int64_t last) {
     for (int64_t g = first; g < last; ++g) {
-      Real* const buffer = g == 0 ? total : buffers + (g - 1) * size;
+      Real* const buffer = g == 0 ? total : rest + (g - 1) * size;
       std::fill(buffer, buffer + size, Real(0));
       for (int64_t c = g; c < chunks; c += groups) work(c * kChunk, std::min(count, (c + 1) * kChunk), buffer, g);
     }
   });
   parallel_ranges(size, 1 << 14, [&](int64_t begin, int64_t end) {
     for (int64_t g = 1; g < groups; ++g) {
-      const Real* const buffer = buffers + (g - 1) * size;
+      const Real* const buffer = rest + (g - 1) * size;
       for (int64_t i = begin; i < end; ++i) total[i] = combine(total[i], buffer[i]);
     }
   });
+}
+
+// The same with buffers of its own for all groups but the first; no more groups than chunks.
+template <class Real, class Work, class Combine>
+void grouped(const Tensor& like, int64_t count, int64_t groups, int64_t size, Real* total, const Work& work,
+             const Combine& combine) {
+  STD_TORCH_CHECK(groups >= 1, "groups: expected at least 1, got ", groups);
+  groups = std::max<int64_t>(1, std::min(groups, (count + kChunk - 1) / kChunk));
+  const Tensor rest = torch::stable::new_empty(like, {groups - 1, size});
+  Real* const buffers = rest.template mutable_data_ptr<Real>();
+  advise_large_pages(total, size * int64_t(sizeof(Real)));
+  advise_large_pages(buffers, (groups - 1) * size * int64_t(sizeof(Real)));
+  grouped(count, groups, size, total, buffers, work, combine);
 }
 
 template <class Real, class Work>

@@ -37,10 +37,10 @@ class Plateau:
     """
 
     limit: int
-    gain: float = 0.005
+    gain: float = 0.01
     window: int = 5
     factor: float = 0.3
-    drops: int = 3
+    drops: int = 2
     scale: float = 1.0
     count: int = 0
     losses: list[float] = field(default_factory=list)
@@ -84,7 +84,7 @@ def descend(
     frame = grid.frame(*MISSING[settings.opacity])
     bundle = (rays.origins, rays.directions)
     seen = (rays.background, rays.target, rays.mask, rays.weight)
-    groups = gradient_groups(store.numel())
+    gradients = store.new_empty(gradient_groups(store.numel()), *store.shape)
     adam = TileAdam(store, settings.opacity, settings.descent)
     rule = Plateau(limit=3 * iterations)
     watch = Stopwatch(seconds)
@@ -105,8 +105,8 @@ def descend(
             loss.huber,
             ray_weights,
             loss.detach_sample,
-            groups,
-            rays.ranges,
+            ranges=rays.ranges,
+            gradients=gradients,
         )
         watch.lap("march")
         voxel_losses = ops.voxel_terms(
