@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import zipfile
+import zlib
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -58,6 +60,7 @@ class SurfaceField(nn.Module):
         expected = (len(grid.coords), ops.TILE, ops.TILE, ops.TILE)
         if voxels.dim() != 5 or tuple(voxels.shape[:4]) != expected:
             raise ValueError(f"voxels: expected {[*expected, '*']}, got {list(voxels.shape)}")
+        grid.check()
         self.sh_degree = ops.degree_of(voxels.shape[-1])
         # The memory behind the parameter is padded to a record's pitch, so that no op has to copy it.
         store = ops.padded(voxels.detach()).contiguous()
@@ -72,6 +75,7 @@ class SurfaceField(nn.Module):
         self.register_buffer("table", grid.table.to(voxels.device), persistent=False)
         self.register_buffer("tile_coords", grid.coords.to(voxels.device), persistent=False)
         self.register_buffer("origin", torch.tensor(grid.origin, dtype=torch.float64), persistent=False)
+        self._corner = grid.origin  # the buffer takes the module's precision, this one stays exact
         self._frame = grid.frame(self.outside, self.inside)
 
     @classmethod
@@ -83,7 +87,7 @@ class SurfaceField(nn.Module):
         voxel_size: float,
         opacity: str = "transparency",
     ) -> SurfaceField:
-        """The field of a dense grid; tiles that are constantly outside or inside (whatever their colour) are not stored.
+        """The field of a dense grid; tiles that are wholly outside or inside (whatever their colour) are not stored.
 
         Args:
             transparency: [X, Y, Z] opacity values (a signed distance in voxels where ``opacity="distance"``); value
@@ -91,6 +95,8 @@ class SurfaceField(nn.Module):
             sh: [X, Y, Z, (B + 1)^2, 3] coefficients, or [X, Y, Z, 3] for degree 0.
             origin: world position of the grid's low corner. voxel_size: world units.
         """
+        if opacity not in LEVEL:
+            raise ValueError(f"opacity: expected transparency or distance, got {opacity!r}")
         if sh.shape[:3] != transparency.shape or transparency.dim() != 3 or sh.shape[-1] != 3:
             raise ValueError(f"sh: expected {[*transparency.shape, '(B + 1)^2', 3]}, got {list(sh.shape)}")
         outside, inside = MISSING[opacity]
@@ -102,16 +108,15 @@ class SurfaceField(nn.Module):
         x, y, z = (n // ops.TILE for n in records.shape[:3])
         tiles = records.reshape(x, 4, y, 4, z, 4, -1).permute(0, 2, 4, 1, 3, 5, 6)
         value = tiles[..., 0].flatten(3)
-        stored = ~((value == outside).all(-1) | (value <= inside).all(-1))
-        corner = [float(c) for c in origin]
-        grid = TileGrid.build(stored, (value <= inside).all(-1), (corner[0], corner[1], corner[2]), voxel_size)
+        solid = (value <= inside).all(-1)
+        cx, cy, cz = (float(c) for c in origin)
+        grid = TileGrid.build(~((value >= outside).all(-1) | solid), solid, (cx, cy, cz), voxel_size)
         i, j, k = grid.coords.long().unbind(1)
         return cls(tiles[i, j, k], grid, opacity)
 
     @property
     def grid(self) -> TileGrid:
-        x, y, z = self.origin.tolist()
-        return TileGrid(self.table, self.tile_coords, (x, y, z), self.voxel_size)
+        return TileGrid(self.table, self.tile_coords, self._corner, self.voxel_size)
 
     @property
     def frame(self) -> list[float]:
@@ -172,8 +177,8 @@ class SurfaceField(nn.Module):
     def sample(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Transparency [P] and colour [P, 3] at ``points [P, 3]`` seen along unit ``directions [P, 3]``.
 
-        The transparency of a signed distance s is that of a long step that ends there, 1/(1 + exp(-slope s)) turned
-        round: 1 outside, 0 inside. Differentiability: voxels.
+        The transparency of a signed distance s is that of a long step that ends there, 1/(1 + exp(-slope s)): 1 outside,
+        0 inside. Differentiability: voxels.
         """
         values = self._read(points)
         opacity = values[:, 0]
@@ -193,7 +198,8 @@ class SurfaceField(nn.Module):
         """The parameter as the ops want it: padded records. The memory behind it, where that still is padded."""
         voxels, width = self.voxels, ops.pitch(self.sh_degree)
         strides = (64 * width, 16 * width, 4 * width, width, 1)
-        if voxels.shape[-1] < width and voxels.stride() == strides and not (voxels.requires_grad and torch.is_grad_enabled()):
+        differentiable = voxels.requires_grad and torch.is_grad_enabled()
+        if voxels.shape[-1] < width and voxels.stride() == strides and not differentiable:
             return voxels.detach().as_strided((*voxels.shape[:4], width), strides)
         return ops.padded(voxels)
 
@@ -217,7 +223,7 @@ class SurfaceField(nn.Module):
             "voxels": self.voxels.detach().cpu().numpy(),
             "table": torch.clamp(self.table, min=ops.OUTSIDE).cpu().numpy(),
             "tile_coords": self.tile_coords.cpu().numpy(),
-            "origin": self.origin.cpu().numpy(),
+            "origin": np.array(self._corner),
             "voxel_size": np.float64(self.voxel_size),
             "opacity": np.str_(self.opacity),
         }
@@ -227,6 +233,7 @@ class SurfaceField(nn.Module):
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SurfaceField:
         """The field of a file that :meth:`save` wrote. Raises InputError if it is none."""
+        expected = "expected an .npz file of SurfaceField.save"
         try:
             with np.load(path, allow_pickle=False) as data:
                 if int(data["format"]) != FORMAT:
@@ -235,10 +242,12 @@ class SurfaceField(nn.Module):
                 table, coords = torch.from_numpy(data["table"]), torch.from_numpy(data["tile_coords"])
                 grid = TileGrid(with_skips(table), coords, (x, y, z), float(data["voxel_size"]))
                 return cls(torch.from_numpy(data["voxels"]), grid, str(data["opacity"]))
-        except (OSError, KeyError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{path}: not a saved field ({error}), expected an .npz file of SurfaceField.save") from error
+        except InputError:
+            raise
+        except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise InputError(f"{path}: not a saved field ({error}), {expected}") from error
+        except (zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"{path}: a damaged file ({error}), {expected}") from error
 
 
 def sh_basis(directions: Tensor, sh_degree: int) -> Tensor:

@@ -1,16 +1,19 @@
 """The soft visual hull: where the subject can be, by its silhouettes alone.
 
 At a point it is the least of the bilinearly read masks of the cameras that see the point, so its level 1/2 is the
-classic visual hull with subpixel borders. Space that too few cameras see is outside.
+classic visual hull with subpixel borders. Space that too few cameras see is outside, and so are phantoms: where the
+silhouettes of two or three cameras meet beside the view of all others, nothing speaks against a subject.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
+from scipy.ndimage import label
 from torch import Tensor
 
 from torch_surfcap import ops
@@ -50,17 +53,35 @@ class Silhouettes:
 
     def hull(self, points: Tensor) -> Tensor:
         """Hull value at world points [..., 3]: float32 in [0, 1], 0 where fewer than ``quorum`` cameras look."""
+        value, votes = self._ask(points)
+        return torch.where(votes >= self.quorum, value, 0.0)
+
+    def occupied(self, points: Tensor) -> Tensor:
+        """Which points of a lattice [X, Y, Z, 3] lie in the hull: bool [X, Y, Z].
+
+        A piece of which no point is seen by half as many cameras as the best seen point is a phantom and left out.
+        """
+        value, votes = self._ask(points)
+        occupied = (value > 0.5) & (votes >= self.quorum)
+        pieces, count = label(occupied.numpy(), np.ones((3, 3, 3)))
+        seen = torch.zeros(count + 1, dtype=votes.dtype)
+        seen.scatter_reduce_(0, torch.from_numpy(pieces).long().flatten(), votes.flatten(), "amax")
+        seen[0] = 0  # what is not occupied
+        return occupied & (2 * seen >= seen.max())[torch.from_numpy(pieces).long()]
+
+    def _ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Least mask and number of the cameras that see world points [..., 3], both [...]."""
         flat = points.reshape(-1, 3)
         # Shifting the world to the points' middle keeps single precision exact to far below a pixel.
         center = flat.double().mean(0) if len(flat) else torch.zeros(3, dtype=torch.float64)
         shifted = self.projections.clone()
         shifted[:, :, 3] += self.projections[:, :, :3] @ center
-        values = []
-        for chunk in flat.split(CHUNK):
-            local = (chunk.double() - center).float()
-            value, votes = ops.soft_hull(local, shifted.float(), self.masks, self.sizes)
-            values.append(torch.where(votes >= self.quorum, value, 0.0))
-        return torch.cat(values).reshape(points.shape[:-1]) if values else points.new_zeros(points.shape[:-1])
+        answers = [
+            ops.soft_hull((chunk.double() - center).float(), shifted.float(), self.masks, self.sizes)
+            for chunk in flat.split(CHUNK)
+        ]
+        value, votes = (torch.cat(column).reshape(points.shape[:-1]) for column in zip(*answers, strict=True))
+        return value, votes
 
 
 def grown(mask: Tensor, pixels: int) -> Tensor:
@@ -77,17 +98,18 @@ def find_box(capture: Capture) -> tuple[Tensor, Tensor]:
     A cube around the point nearest to all central rays is sampled with masks that are widened to the sampling, and
     shrunk to what is occupied until it stays put.
 
-    Raises InputError if no region is seen by enough cameras, or if the silhouettes have no common volume.
+    Raises InputError if a mask is missing or empty, or if the silhouettes have no common volume.
     """
-    assert capture.masks is not None
+    if capture.masks is None:
+        raise InputError("capture: no masks, expected silhouettes (Capture.masks) for the scene's box")
     center, radius = _first_guess(capture)
     low, high = center - radius, center + radius
     volume = torch.prod(high - low)
     for _ in range(BOX_ROUNDS):
         cell = float((high - low).max()) / BOX_CELLS
         points, spacing = _lattice(low, high, cell)
-        reach = _pixels_per_unit(capture.cameras, (low + high) / 2) * cell / 2
-        occupied = points[_widened(capture, reach).hull(points) > 0.5]
+        reach = _pixels_per_unit(capture.cameras, (low + high) / 2) * cell * math.sqrt(3.0) / 2
+        occupied = points[_widened(capture, reach).occupied(points)]
         if len(occupied) == 0:
             raise InputError(
                 "silhouettes: their cones have no common volume, expected masks of one subject and world-to-camera poses "
@@ -117,7 +139,9 @@ def _first_guess(capture: Capture) -> tuple[Tensor, float]:
         projector = torch.eye(3, dtype=torch.float64) - direction[0, :, None] * direction[0]
         normal += projector
         moment += projector @ origin[0]
-        corners = torch.tensor([[u.min(), v.min()], [u.max(), v.min()], [u.min(), v.max()], [u.max(), v.max()]])
+        corners = torch.tensor(
+            [[u.min(), v.min()], [u.max(), v.min()], [u.min(), v.max()], [u.max(), v.max()]]
+        )
         _, directions = cameras.rays(i, corners.double() + 0.5)
         cosine = (directions @ direction[0]).amin().clamp(0.1, 1.0)
         extents.append(float(torch.sqrt(1 / cosine**2 - 1)))
@@ -141,8 +165,8 @@ def _pixels_per_unit(cameras: Cameras, point: Tensor) -> Tensor:
 
 
 def _widened(capture: Capture, reach: Tensor) -> Silhouettes:
-    """Silhouettes grown by a cell's ``reach`` [V] in pixels, so that no thin part is lost between the cells; at half the
-    size as long as the reach is over four pixels."""
+    """Silhouettes grown by ``reach`` [V] in pixels, half a cell's diagonal, so that no thin part is lost between the
+    cells; at half the size as long as the reach is over four pixels."""
     masks, cameras = capture.masks, capture.cameras
     assert masks is not None
     while float(reach.median()) > 4.0 and int(cameras.size.min()) > 8:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,9 @@ class TileGrid:
     voxel_size: float
 
     @staticmethod
-    def build(stored: Tensor, inside: Tensor, origin: tuple[float, float, float], voxel_size: float) -> TileGrid:
+    def build(
+        stored: Tensor, inside: Tensor, origin: tuple[float, float, float], voxel_size: float
+    ) -> TileGrid:
         """The grid of the tiles marked in ``stored [X, Y, Z]`` bool; of the others those in ``inside`` are inside."""
         coords = morton_sorted(stored.nonzero().to(torch.int32))
         table = torch.full([n + 2 for n in stored.shape], OUTSIDE, dtype=torch.int32, device=stored.device)
@@ -39,6 +42,28 @@ class TileGrid:
         x, y, z = (coords.long() + 1).unbind(1)
         table[x, y, z] = torch.arange(len(coords), dtype=torch.int32, device=stored.device)
         return TileGrid(with_skips(table), coords, origin, float(voxel_size))
+
+    def check(self) -> None:
+        """Raises ValueError where the table and the tiles contradict each other: the ops read what the table says."""
+        table, coords, tiles = self.table, self.coords, len(self.coords)
+        if table.dim() != 3 or min(table.shape) < 3 or table.dtype != torch.int32:
+            raise ValueError(f"table: expected int32 [X+2, Y+2, Z+2], got {table.dtype} {list(table.shape)}")
+        if coords.shape != (tiles, 3) or coords.dtype != torch.int32:
+            raise ValueError(f"tile_coords: expected int32 [T, 3], got {coords.dtype} {list(coords.shape)}")
+        if not (self.voxel_size > 0 and all(math.isfinite(c) for c in (*self.origin, self.voxel_size))):
+            raise ValueError(
+                f"origin, voxel_size: expected finite numbers, got {self.origin}, {self.voxel_size}"
+            )
+        if tiles and not (coords.amin() >= 0 and (coords < coords.new_tensor(self.size)).all()):
+            raise ValueError(f"tile_coords: expected places within {list(self.size)} tiles")
+        x, y, z = self.places.long().unbind(1)
+        index = torch.arange(tiles, dtype=torch.int32, device=table.device)
+        if int((table >= 0).sum()) != tiles or not torch.equal(table[x, y, z], index):
+            raise ValueError(f"table: expected the {tiles} tiles at their tile_coords and nowhere else")
+        if int(table.min()) < OUTSIDE - MAX_SKIP:
+            raise ValueError(
+                f"table: expected entries of at least {OUTSIDE - MAX_SKIP}, got {int(table.min())}"
+            )
 
     @property
     def size(self) -> tuple[int, int, int]:
@@ -79,7 +104,9 @@ class TileGrid:
         tile, x, y, z = surface.nonzero().unbind(1)
         voxel = self.coords.long()[tile] * TILE + torch.stack([x, y, z], 1)
         for corner in range(27):
-            offset = torch.tensor([corner // 9 - 1, corner // 3 % 3 - 1, corner % 3 - 1], device=surface.device)
+            offset = torch.tensor(
+                [corner // 9 - 1, corner // 3 % 3 - 1, corner % 3 - 1], device=surface.device
+            )
             fine = torch.div(voxel + offset, 2, rounding_mode="floor")
             fine = fine[((fine >= 0) & (fine < fine_size)).all(1)]
             stored[fine[:, 0], fine[:, 1], fine[:, 2]] = True
@@ -110,12 +137,10 @@ def with_skips(table: Tensor) -> Tensor:
         low[axis], high[axis] = slice(None, -1), slice(1, None)
         upper[tuple(low)] = cell[tuple(high)]
         cell |= upper
+    skips = np.full(cell.shape, MAX_SKIP, dtype=np.int32)
     if cell.any():
-        distance = distance_transform_cdt(~cell, metric="chessboard")
-    else:
-        distance = np.full(cell.shape, MAX_SKIP)
-    skips = torch.from_numpy(np.minimum(distance, MAX_SKIP).astype(np.int32)).to(table.device)
-    return torch.where(table > OUTSIDE, table, OUTSIDE - skips)
+        skips = np.minimum(distance_transform_cdt(~cell, metric="chessboard"), MAX_SKIP).astype(np.int32)
+    return torch.where(table > OUTSIDE, table, OUTSIDE - torch.from_numpy(skips).to(table.device))
 
 
 def morton_sorted(coords: Tensor) -> Tensor:
