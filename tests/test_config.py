@@ -126,6 +126,30 @@ def test_defaults_are_the_librarys() -> None:
     )
 
 
+def test_resolved_config_holds_the_defaults_that_are_used() -> None:
+    given = config.load(None, ["opacity=transparency", "losses.mask=0.5"])
+    full = config.resolved(given)
+    assert full.losses.mask == 0.5
+    assert None not in [*vars(full.losses).values(), *vars(full.descent).values(), full.mesh.smooth]
+    assert (full.voxel, full.levels, full.sh_degree) == (None, None, None)  # by the capture
+    assert FitSettings.of(**config.fit_arguments(full)) == FitSettings.of(**config.fit_arguments(given))
+    assert config.resolved(full) == full
+
+
+def test_differences() -> None:
+    one, other = config.load(None, ["seed=1", "losses.mask=2"]), config.load(None, ["losses.mask=3"])
+    assert config.differences(one, other) == {"seed": (1, 0), "losses.mask": (2.0, 3.0)}
+    assert config.differences(one, one) == {}
+
+
+@pytest.mark.parametrize("threshold", ["-5", "4", "9"])
+def test_threshold_beyond_the_values(threshold: str) -> None:
+    with pytest.raises(InputError, match=r"mesh\.threshold is .*, expected more than -4 and less than 4"):
+        config.resolved(config.load(None, [f"mesh.threshold={threshold}"]))
+    with pytest.raises(InputError, match="for opacity=transparency"):
+        config.resolved(config.load(None, ["mesh.threshold=1.5", "opacity=transparency"]))
+
+
 def test_losses_and_descent_mirror_the_library() -> None:
     for mine, theirs in ((config.LossesConfig, Losses), (config.DescentConfig, Descent)):
         assert [f.name for f in fields(mine)] == [f.name for f in fields(theirs)]

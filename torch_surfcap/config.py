@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from yaml import YAMLError
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.data.readers import FORMATS
 from torch_surfcap.errors import InputError
+from torch_surfcap.field.field import MISSING
 from torch_surfcap.fitting.settings import LOSSES, FitSettings
 
 
@@ -81,8 +82,8 @@ class CamerasConfig:
 @dataclass
 class MeshConfig:
     threshold: float | None = None  # opacity value of the surface; auto: 0.81 transparency, 0 distance
-    smooth: int = _within(FitSettings.smooth, 0)  # rounds of Taubin smoothing
-    specks: float = _within(FitSettings.specks, 0, 1)  # pieces under this fraction of the largest area go
+    smooth: int | None = _within(None, 0)  # rounds of Taubin smoothing
+    specks: float | None = _within(None, 0, 1)  # pieces under this fraction of the largest area go
 
 
 @dataclass
@@ -94,7 +95,7 @@ class Config:
     sh_degree: int | None = _one_of(None, 0, 1, 2)  # of the colour's dependence on the direction of view
     voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
-    opacity: str = _one_of(FitSettings.opacity, *LOSSES)  # what a voxel stores
+    opacity: str | None = _one_of(None, *LOSSES)  # what a voxel stores
     losses: LossesConfig = field(default_factory=LossesConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
@@ -133,8 +134,9 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Sequence[str] = 
 
 
 def fit_arguments(config: Config) -> dict[str, Any]:
-    """What `torch_surfcap.fit` takes of a config, but for the device, which the command chooses."""
-    return {
+    """What `torch_surfcap.fit` takes of a config, but for the device, which the command chooses. What is None is
+    left out: the library's default."""
+    arguments = {
         "opacity": config.opacity,
         "sh_degree": config.sh_degree,
         "voxel": config.voxel,
@@ -147,14 +149,39 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "losses": dict(vars(config.losses)),
         "descent": dict(vars(config.descent)),
     }
+    return {name: value for name, value in arguments.items() if value is not None}
+
+
+def resolved(config: Config) -> Config:
+    """The config with the library's defaults in place of None, but for what is chosen by the capture. Raises
+    InputError for values that do not go together."""
+    try:
+        s = FitSettings.of(**fit_arguments(config))
+    except ValueError as error:
+        raise InputError(f"settings: {error}") from error
+    outside, inside = MISSING[s.opacity]
+    if s.threshold is not None and not inside < s.threshold < outside:
+        expected = f"more than {inside:g} and less than {outside:g} for opacity={s.opacity}"
+        raise InputError(f"mesh.threshold is {s.threshold:g}, expected {expected}")
+    return replace(
+        config,
+        opacity=s.opacity,
+        losses=LossesConfig(**vars(s.losses)),
+        descent=DescentConfig(**vars(s.descent)),
+        mesh=MeshConfig(s.threshold, s.smooth, s.specks),
+    )
+
+
+def differences(a: Config, b: Config) -> dict[str, tuple[Any, Any]]:
+    """The keys whose values differ, with both values."""
+    left, right = (dict(_flatten(_plain(config))) for config in (a, b))
+    return {key: (left[key], right[key]) for key in left if left[key] != right[key]}
 
 
 def save(config: Config, path: str | os.PathLike[str]) -> None:
     """Write every setting as YAML; `load` gives the same Config back."""
-    plain = OmegaConf.to_container(OmegaConf.structured(config))
-    assert isinstance(plain, dict)
     with atomic_write(path) as partial:
-        partial.write_text(OmegaConf.to_yaml(_replace(plain, None, "auto")), encoding="utf-8")
+        partial.write_text(OmegaConf.to_yaml(_replace(_plain(config), None, "auto")), encoding="utf-8")
 
 
 def key_names(schema: Any = Config, prefix: str = "") -> Iterator[str]:
@@ -165,6 +192,12 @@ def key_names(schema: Any = Config, prefix: str = "") -> Iterator[str]:
             yield from key_names(nested, f"{prefix}{entry.name}.")
         else:
             yield prefix + entry.name
+
+
+def _plain(config: Config) -> dict[Any, Any]:
+    plain = OmegaConf.to_container(OmegaConf.structured(config))
+    assert isinstance(plain, dict)
+    return plain
 
 
 def _read(path: Path) -> DictConfig:
