@@ -18,6 +18,7 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.images import as_float
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.hull import Silhouettes, find_box, pixel_footprint
 
@@ -213,9 +214,9 @@ def brightness(capture: Capture) -> Tensor:
     """[N] median brightness (0 to 1) of the subject in each photograph."""
     assert capture.masks is not None
     values = []
-    for i, mask in enumerate(capture.masks):
-        subject = mask >= min(0.9, float(mask.max()))
-        values.append(float(capture.photograph(i)[subject].mean(dim=1).median()))
+    for image, mask in zip(capture.images, capture.masks, strict=True):
+        subject = mask.numpy() >= min(0.9, float(mask.max()))
+        values.append(float(np.median(as_float(image.numpy()[subject]).mean(axis=1))))
     return torch.tensor(values, dtype=torch.float64)
 
 

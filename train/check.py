@@ -33,7 +33,9 @@ from torch_surfcap.field.hull import find_box
 
 FILLED = 0.95  # less than this share of the silhouettes filled on average is a finding
 FILLED_ONE = 0.85  # ... and less than this of one camera's
-EXPOSURE = 1.4  # so many times brighter or darker than the median camera is a finding
+EXPOSURE = (
+    1.4  # so many times brighter or darker than the median camera is worth a note: exposure, or a dark side
+)
 AXES = 0.06  # length of the drawn frusta, relative to the distance between cameras and box
 
 

@@ -72,8 +72,11 @@ def make_sample_scene(
     _ = mesh.vertex_normals, mesh.ray  # made once, before the threads share the mesh
     for split, count in (("test", test_views), ("train", views)):
         cameras = sample_cameras(count, size, turn=float(rng.uniform(0, 2 * np.pi)))
-        in_threads(partial(_write_view, folder, split, mesh, cameras, seed), range(count))
-        _write_transforms(folder / f"transforms_{split}.json", cameras, split, parameters)
+        transforms = folder / f"transforms_{split}.json"
+        transforms.unlink(missing_ok=True)
+        if count:
+            in_threads(partial(_write_view, folder, split, mesh, cameras, seed), range(count))
+            _write_transforms(transforms, cameras, split, parameters)
     return folder
 
 
@@ -96,7 +99,11 @@ def sample_cameras(count: int, size: int, turn: float = 0.0) -> Cameras:
         pose[:3, :3] = [right, np.cross(forward, right), forward]
         pose[:3, 3] = -pose[:3, :3] @ center
         poses.append(pose)
-    return Cameras(K.repeat(count, 1, 1), torch.from_numpy(np.array(poses)), torch.full((count, 2), size))
+    return Cameras(
+        K.repeat(count, 1, 1),
+        torch.from_numpy(np.array(poses).reshape(count, 4, 4)),
+        torch.full((count, 2), size),
+    )
 
 
 def render_view(mesh: trimesh.Trimesh, cameras: Cameras, i: int, seed: int) -> tuple[Array, Array, Array]:

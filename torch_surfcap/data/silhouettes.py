@@ -81,7 +81,7 @@ def black_silhouette(photograph: Picture) -> Plane | None:
     levels = np.clip(brightness * 255 + 0.5, 0, 255).astype(np.uint8)
     otsu, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_OTSU)
     background = levels[levels <= otsu]
-    if np.median(background) > DARK * 255 or otsu == 0:
+    if np.median(background) > DARK * 255 or len(background) == levels.size:
         return None
     histogram = gaussian_filter1d(np.bincount(levels.ravel(), minlength=256).astype(np.float64), 4.0)
     first = int(min(np.percentile(background, 75), otsu))
@@ -98,9 +98,12 @@ def _exposed_alike(photograph: Plane, plate: Plane) -> Plane:
     fitted = np.empty_like(plate)
     for channel in range(3):
         p, b = photograph[:, :, channel].ravel(), plate[:, :, channel].ravel()
-        usable = (p > 0.01) & (p < 0.99) & (b > 0.01) & (b < 0.99)
+        usable = (p < 0.99) & (b < 0.99)
         p, b = p[usable], b[usable]
-        gain, bias = (float(np.median(p) / max(np.median(b), 1e-3)), 0.0) if len(p) else (1.0, 0.0)
+        ratio = float(np.median(p) / max(float(np.median(b)), 1e-3)) if len(p) else 1.0
+        # whichever explains more of the picture: a subject that fills half of it must not set the gain
+        gain = min((1.0, ratio), key=lambda g: float(np.median(np.abs(p - g * b))) if len(p) else 0.0)
+        bias = 0.0
         if len(p) >= 100 and b.std() > 1e-3:
             for _ in range(8):  # least squares on the agreeing part, which the fit then decides anew
                 residual = np.abs(p - gain * b - bias)
