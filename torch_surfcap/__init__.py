@@ -4,3 +4,6 @@ from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import RayOutput, SurfaceField
+from torch_surfcap.fitting.fit import FitResult, fit
+
+__all__ = ["Cameras", "Capture", "FitResult", "InputError", "RayOutput", "SurfaceField", "fit", "load_capture"]

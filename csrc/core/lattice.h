@@ -11,6 +11,7 @@ inline namespace SURFCAP_ISA {
 template <class Real> struct Line {
   Pack<Real, 4> origin, direction;
 
+  Line() = default;
   SURFCAP_HD Line(const Field<Real>& field, const Real* o, const Real* d) {
     constexpr Real kHair = Real(1e-20);
     origin = zero_pack<Real, 4>();
@@ -26,8 +27,10 @@ template <class Real> struct Line {
 // The cells of the table that a ray passes, from front to back; empty neighbourhoods are left in one stride.
 template <class Real> class Cells {
  public:
-  SURFCAP_HD Cells(const Field<Real>& field, const Line<Real>& line) : field_(field), line_(line) {
+  Cells() = default;
+  SURFCAP_HD Cells(const Field<Real>& field, const Line<Real>& ray) : line(ray), table_(field.table) {
     inverse_ = fill_pack<Real, 4>(Real(1)) / line.direction;
+    for (int axis = 0; axis < 2; ++axis) stride_[axis] = field.n[axis + 1];
     Real high[4] = {};
     int32_t last_cell[4] = {}, forward[4] = {};
     for (int axis = 0; axis < 3; ++axis) {
@@ -48,22 +51,23 @@ template <class Real> class Cells {
   // middle of, and returns whether it is empty.
   SURFCAP_HD bool empty(Real t, Real& leave) const {
     using Index = Pack<int32_t, 4>;
-    Index cell = convert_pack<int32_t, 4, Real>(line_.origin + t * line_.direction) >> 2;
+    Index cell = convert_pack<int32_t, 4, Real>(line.origin + t * line.direction) >> 2;
     cell = smaller_pack<int32_t, 4>(larger_pack<int32_t, 4>(cell, fill_pack<int32_t, 4>(0)), last_cell_);
-    const int32_t entry = field_.table[(cell[0] * field_.n[1] + cell[1]) * field_.n[2] + cell[2]];
+    const int32_t entry = table_[(cell[0] * stride_[0] + cell[1]) * stride_[1] + cell[2]];
     const bool is_empty = entry < kOutside;
     const int32_t reach = is_empty ? kOutside - entry - 1 : 0;  // cells around this one that are empty too
     const Index border = (cell + forward_ * (2 * reach + 1) - reach) * kTile;
-    const Pack<Real, 4> at = (convert_pack<Real, 4, int32_t>(border) - line_.origin) * inverse_;
+    const Pack<Real, 4> at = (convert_pack<Real, 4, int32_t>(border) - line.origin) * inverse_;
     leave = smaller(smaller(at[0], at[1]), at[2]);
     return is_empty;
   }
 
+  Line<Real> line;
   Real near, far;  // where the ray enters and leaves the table; near >= far: it misses
 
  private:
-  const Field<Real>& field_;
-  const Line<Real>& line_;
+  const int32_t* table_;
+  int32_t stride_[2];  // cells along y and z
   Pack<Real, 4> inverse_;
   Pack<int32_t, 4> last_cell_, forward_;  // forward: 1 where the ray runs up the axis
 };
@@ -72,6 +76,7 @@ template <class Real> class Cells {
 // integration ranges where they are known.
 template <class Real> class Lattice {
  public:
+  Lattice() = default;
   SURFCAP_HD Lattice(const Cells<Real>& cells, Real step, Real shift, const Real* ranges, int32_t range_count)
       : cells_(cells), ranges_(ranges), left_(range_count), step_(step), per_step_(Real(1) / step),
         offset_(Real(0.5) + shift) {
@@ -81,7 +86,11 @@ template <class Real> class Lattice {
     known_until_ = k_;
   }
 
-  SURFCAP_HD Real offset() const { return offset_; }
+  // Positions u and distances t of the samples with indices k.
+  SURFCAP_HD void place(const int32_t* k, Pack<Real, kLanes>& t, Pack<Real, kLanes> (&u)[3]) const {
+    t = (convert_pack<Real, kLanes, int32_t>(load<int32_t, kLanes>(k)) + offset_) * step_;
+    for (int axis = 0; axis < 3; ++axis) u[axis] = cells_.line.origin[axis] + t * cells_.line.direction[axis];
+  }
 
   // Writes up to `capacity` indices; fewer mean that the ray is at its end.
   SURFCAP_HD int next(int32_t* k_out, int capacity) {
@@ -122,7 +131,7 @@ template <class Real> class Lattice {
     return k_ < known_until_;
   }
 
-  const Cells<Real>& cells_;
+  Cells<Real> cells_;
   const Real* ranges_;
   int32_t left_;
   Real step_, per_step_, offset_;

@@ -42,60 +42,77 @@ template <class Real> SURFCAP_HD int64_t trace_capacity(const Field<Real>& field
   return (longest / kLanes + 2) * kLanes;
 }
 
-// `gradient`, where given, is what the walk back will add to: it is fetched meanwhile.
-template <class Real, int Degree, class Opacity>
-SURFCAP_HD RayResult<Real> walk_forward(const Field<Real>& field, const Real* missing_records, const Line<Real>& line,
-                                        const Coefficients<Real, Degree>& weights, const RaySettings<Real>& settings,
-                                        Lattice<Real> lattice, const Opacity& opacity,
-                                        const Trace<Real, Opacity>& trace, const Real* gradient) {
-  RayResult<Real> ray{zero_pack<Real, 4>(), Real(1), Real(0), 0};
-  typename Opacity::State before = opacity.outside();
-  Pack<Real, 4> color_before = zero_pack<Real, 4>();
-  int k_before = -2;
-  for (bool alive = true; alive;) {
-    int32_t k[kLanes];
-    const int count = lattice.next(k, kLanes);
-    if (count == 0) break;
+// The walk forward. It comes in two parts so that several rays can be in flight: `start` finds the first samples and asks
+// for what they read, `finish` goes through all samples.
+template <class Real, int Degree, class Opacity> struct Walk {
+  Lattice<Real> lattice;
+  Coefficients<Real, Degree> weights;
+  Trace<Real, Opacity> trace;
+  RayResult<Real> ray;
+  int32_t k[kLanes];
+  Pack<Real, kLanes> t;
+  int count;  // samples set up and not yet gone through
+
+  SURFCAP_HD void start(const Field<Real>& field, const Lattice<Real>& samples, const Real* direction,
+                        const Trace<Real, Opacity>& room) {
+    lattice = samples;
+    weights = basis_weights<Real, Degree>(direction);
+    trace = room;
+    ray = {zero_pack<Real, 4>(), Real(1), Real(0), 0};
+    set_up(field);
+  }
+
+  // `gradient`, where given, is what the walk back will add to: it is fetched meanwhile.
+  SURFCAP_HD void finish(const Field<Real>& field, const Real* missing_records, Real stop, const Opacity& opacity,
+                         const Real* gradient) {
+    typename Opacity::State before = opacity.outside();
+    Pack<Real, 4> color_before = zero_pack<Real, 4>();
+    int k_before = -2;
+    while (count > 0) {
+      const Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
+      int l = 0;
+      for (bool alive = true; alive && l < count; ++l) {
+        Pack<Real, 4> color = fold<Real, Degree>(interpolate<Real, Degree>(field, missing_records, at, l), weights);
+        Sample<Real, Opacity>& sample = trace.samples[ray.samples++];
+        sample.starts_run = k[l] != k_before + 1;
+        k_before = k[l];
+        sample.before = sample.starts_run ? opacity.outside() : before;
+        sample.now = before = opacity.prepare(color[0]);
+        sample.a = opacity.transparency(sample.before, sample.now);
+        sample.t = t[l];
+        sample.transmittance = ray.transmittance;
+        if constexpr (Opacity::kMidpointColor) {
+          const Pack<Real, 4> here = color;
+          if (!sample.starts_run) color = Real(0.5) * (here + color_before);
+          color[0] = here[0];
+          color_before = here;
+        }
+        sample.color = color;
+        const Real w = (Real(1) - sample.a) * ray.transmittance;
+        color[0] = t[l];  // the sum's first lane is the depth's
+        ray.sum += w * color;
+        ray.opacity += w;
+        ray.transmittance *= sample.a;
+        alive = !(ray.transmittance < stop);
+      }
+      if (gradient) prefetch<Real, Degree>(gradient, at, l);
+      if (l < kLanes || ray.transmittance < stop) break;
+      set_up(field);
+    }
+  }
+
+ private:
+  SURFCAP_HD void set_up(const Field<Real>& field) {
+    count = lattice.next(k, kLanes);
+    if (count == 0) return;
     for (int l = count; l < kLanes; ++l) k[l] = k[count - 1];
-    const Pack<Real, kLanes> t =
-        (convert_pack<Real, kLanes, int32_t>(load<int32_t, kLanes>(k)) + lattice.offset()) * settings.step;
     Pack<Real, kLanes> u[3];
-    for (int axis = 0; axis < 3; ++axis) u[axis] = line.origin[axis] + t * line.direction[axis];
+    lattice.place(k, t, u);
     Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
     locate(field, u, at);
     prefetch<Real, Degree>(field.voxels, at, count);
-    if (gradient) prefetch<Real, Degree>(gradient, at, count);
-    for (int l = 0; l < count; ++l) {
-      Pack<Real, 4> color = fold<Real, Degree>(interpolate<Real, Degree>(field, missing_records, at, l), weights);
-      Sample<Real, Opacity>& sample = trace.samples[ray.samples++];
-      sample.starts_run = k[l] != k_before + 1;
-      k_before = k[l];
-      sample.before = sample.starts_run ? opacity.outside() : before;
-      sample.now = before = opacity.prepare(color[0]);
-      sample.a = opacity.transparency(sample.before, sample.now);
-      sample.t = t[l];
-      sample.transmittance = ray.transmittance;
-      if constexpr (Opacity::kMidpointColor) {
-        const Pack<Real, 4> here = color;
-        if (!sample.starts_run) color = Real(0.5) * (here + color_before);
-        color[0] = here[0];
-        color_before = here;
-      }
-      sample.color = color;
-      const Real w = (Real(1) - sample.a) * ray.transmittance;
-      color[0] = t[l];  // the sum's first lane is the depth's
-      ray.sum += w * color;
-      ray.opacity += w;
-      ray.transmittance *= sample.a;
-      if (ray.transmittance < settings.stop) {
-        alive = false;
-        break;
-      }
-    }
-    alive = alive && count == kLanes;
   }
-  return ray;
-}
+};
 
 // `term(sample, r, dc)` gives a sample's r_k and the derivative of r_k by its colour (lanes 1..3 of dc), and may give
 // a part of r_k that does not move the weights. Gradients are scattered into `gradient`.

@@ -6,6 +6,8 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
+constexpr int kBundle = 8;  // rays in flight
+
 // Huber's norm, x^2/2 below eps and eps (|x| - eps/2) above, and its derivative; both without a branch.
 template <class Real> SURFCAP_HD Real huber(Real x, Real eps, Real& derivative) {
   derivative = clamped(x, -eps, eps);
@@ -23,28 +25,39 @@ template <class Real> SURFCAP_HD Real dot_color(const Pack<Real, 4>& a, const Pa
   return p[1] + p[2] + p[3];
 }
 
+// Marches rays through a field. `trace` has room for `bundle` rays of `capacity` samples each.
 template <class Real, int Degree, class Opacity> struct Marcher {
+  using Walk = surfcap::Walk<Real, Degree, Opacity>;
   const Field<Real>& field;
   const RaySettings<Real>& settings;
   const Opacity& opacity;
-  const Trace<Real, Opacity>& trace;
+  Trace<Real, Opacity> trace;
+  int64_t capacity;
   Real missing_records[2 * Record<Degree>::kPitch];
 
-  SURFCAP_HD Marcher(const Field<Real>& f, const RaySettings<Real>& s, const Opacity& o, const Trace<Real, Opacity>& t)
-      : field(f), settings(s), opacity(o), trace(t) {
+  SURFCAP_HD Marcher(const Field<Real>& f, const RaySettings<Real>& s, const Opacity& o, const Trace<Real, Opacity>& t,
+                     int64_t c)
+      : field(f), settings(s), opacity(o), trace(t), capacity(c) {
     fill_missing<Real, Degree>(field, missing_records);
   }
 
-  SURFCAP_HD RayResult<Real> forward(const Rays<Real>& rays, int64_t i,
-                                     const Coefficients<Real, Degree>& weights,
-                                     const Real* gradient = nullptr) const {
-    const Line<Real> line(field, rays.origins + 3 * i, rays.directions + 3 * i);
-    const Cells<Real> cells(field, line);
+  // Begins ray i in the `slot`-th room of the trace.
+  SURFCAP_HD void start(Walk& walk, const Rays<Real>& rays, int64_t i, int slot = 0) const {
+    const Cells<Real> cells(field, Line<Real>(field, rays.origins + 3 * i, rays.directions + 3 * i));
     const int64_t first = rays.ranges ? rays.range_offsets[i] : 0;
     const Lattice<Real> lattice(cells, settings.step, rays.shift[i], rays.ranges ? rays.ranges + 2 * first : nullptr,
                                 rays.ranges ? int32_t(rays.range_offsets[i + 1] - first) : 0);
-    return walk_forward<Real, Degree, Opacity>(field, missing_records, line, weights, settings, lattice, opacity,
-                                               trace, gradient);
+    walk.start(field, lattice, rays.directions + 3 * i,
+               {trace.samples + slot * capacity, trace.footprints + slot * capacity / kLanes});
+  }
+
+  SURFCAP_HD void finish(Walk& walk, const Real* gradient = nullptr) const {
+    walk.finish(field, missing_records, settings.stop, opacity, gradient);
+  }
+
+  template <class Term>
+  SURFCAP_HD void back(const Walk& walk, Real r_inf, const Term& term, Real* gradient, Real* spare) const {
+    walk_back<Real, Degree, Opacity>(walk.trace, walk.ray.samples, opacity, walk.weights, r_inf, term, gradient, spare);
   }
 };
 
@@ -52,8 +65,10 @@ template <class Real, int Degree, class Opacity> struct Marcher {
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD void render_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real* color,
                            Real* transmittance, Real* depth) {
-  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
-  const RayResult<Real> ray = march.forward(rays, i, weights);
+  typename Marcher<Real, Degree, Opacity>::Walk walk;
+  march.start(walk, rays, i);
+  march.finish(walk);
+  const RayResult<Real>& ray = walk.ray;
   for (int c = 0; c < 3; ++c) color[3 * i + c] = ray.sum[c + 1] + ray.transmittance * rays.background[3 * i + c];
   transmittance[i] = ray.transmittance;
   depth[i] = ray.opacity > Real(0) ? ray.sum[0] / ray.opacity : Real(__builtin_nan(""));
@@ -64,8 +79,10 @@ template <class Real, int Degree, class Opacity>
 SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
                                     const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth,
                                     Real* gradient, Real* spare) {
-  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
-  const RayResult<Real> ray = march.forward(rays, i, weights, gradient);
+  typename Marcher<Real, Degree, Opacity>::Walk walk;
+  march.start(walk, rays, i);
+  march.finish(walk, gradient);
+  const RayResult<Real>& ray = walk.ray;
   // depth D = S/O with S = sum w t and O = sum w: dD = (t - D)/O per unit of w. Empty rays have no depth to pull on.
   const bool solid = ray.opacity > Real(0);
   const Real by_depth = solid ? grad_depth[i] / ray.opacity : Real(0);
@@ -76,17 +93,16 @@ SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march,
     dc = by_color;
     return dot_color<Real>(by_color, sample.color) + by_depth * (sample.t - depth);
   };
-  walk_back<Real, Degree, Opacity>(march.trace, ray.samples, march.opacity, weights, r_inf, term, gradient, spare);
+  march.back(walk, r_inf, term, gradient, spare);
 }
 
-// One ray of the fused step: adds (photo, sample, mask), each times the ray's weight, to `losses`, the gradient of their
+// One ray of the fused step, its walk forward done: adds (photo, sample, mask), each times the ray's weight, to `losses`, the gradient of their
 // weighted sum to `gradient`, and writes colour and transmittance.
 template <class Real, int Degree, class Opacity>
-SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays,
-                                const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t i,
+SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march,
+                                const Walk<Real, Degree, Opacity>& walk, const Rays<Real>& rays, const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t i,
                                 double* losses, Real* color, Real* transmittance, Real* gradient, Real* spare) {
-  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
-  const RayResult<Real> ray = march.forward(rays, i, weights, gradient);
+  const RayResult<Real>& ray = walk.ray;
   const Pack<Real, 4> target = color_of(seen.target + 3 * i), background = color_of(rays.background + 3 * i);
   const Pack<Real, 4> rendered = ray.sum + ray.transmittance * background;
   const Real weight = seen.weight[i];
@@ -113,10 +129,27 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
     sample_loss += (Real(1) - sample.a) * sample.transmittance * distance;
     return dot_color<Real>(by_color, sample.color) + (loss.detach_sample ? Real(0) : sample_weight * distance);
   };
-  walk_back<Real, Degree, Opacity>(march.trace, ray.samples, march.opacity, weights, r_inf, term, gradient, spare);
+  march.back(walk, r_inf, term, gradient, spare);
   losses[0] += double(weight * photo);
   losses[1] += double(weight * sample_loss);
   losses[2] += double(weight * excess * excess);
+}
+
+// The rays begin..end of the fused step, a bundle at a time: all its rays are started before the first is gone through,
+// and all are gone through before the first walk back, so that the waits for memory overlap.
+template <class Real, int Degree, class Opacity>
+SURFCAP_HD void photometric_rays(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays,
+                                 const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin,
+                                 int64_t end, double* losses, Real* color, Real* transmittance, Real* gradient,
+                                 Real* spare) {
+  typename Marcher<Real, Degree, Opacity>::Walk walks[kBundle];
+  for (int64_t first = begin; first < end; first += kBundle) {
+    const int count = int(smaller<int64_t>(kBundle, end - first));
+    for (int r = 0; r < count; ++r) march.start(walks[r], rays, first + r, r);
+    for (int r = 0; r < count; ++r) march.finish(walks[r], gradient);
+    for (int r = 0; r < count; ++r)
+      photometric_ray(march, walks[r], rays, seen, loss, first + r, losses, color, transmittance, gradient, spare);
+  }
 }
 
 // Integration ranges (paper, section 4.1) of ray i: the stretches [begin, end) of distance that are not as good as empty,
@@ -125,13 +158,15 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real quiet,
                           Real* out) {
-  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
-  const RayResult<Real> ray = march.forward(rays, i, weights);
+  typename Marcher<Real, Degree, Opacity>::Walk walk;
+  march.start(walk, rays, i);
+  march.finish(walk);
+  const RayResult<Real>& ray = walk.ray;
   const Real step = march.settings.step;
   int count = 0;
   Real end = Real(-1);
   for (int k = 0; k < ray.samples; ++k) {
-    const Sample<Real, Opacity>& sample = march.trace.samples[k];
+    const Sample<Real, Opacity>& sample = walk.trace.samples[k];
     if (!(sample.color[0] < quiet)) continue;
     if (sample.t - step > end) {
       out[2 * count] = sample.t - step;
@@ -147,11 +182,13 @@ SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Ray
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD void visibility_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
                                Real* seen) {
-  const auto weights = basis_weights<Real, Degree>(rays.directions + 3 * i);
-  const RayResult<Real> ray = march.forward(rays, i, weights);
+  typename Marcher<Real, Degree, Opacity>::Walk walk;
+  march.start(walk, rays, i);
+  march.finish(walk);
+  const RayResult<Real>& ray = walk.ray;
   for (int k = 0; k < ray.samples; ++k) {
-    const Sample<Real, Opacity>& sample = march.trace.samples[k];
-    const Footprints<Real>& at = march.trace.footprints[k / kLanes];
+    const Sample<Real, Opacity>& sample = walk.trace.samples[k];
+    const Footprints<Real>& at = walk.trace.footprints[k / kLanes];
     for (int c = 0; c < 8; ++c) {
       const int64_t voxel = at.voxel[c][k % kLanes];
       if (voxel < 0 || !(at.weight[c][k % kLanes] > Real(0))) continue;

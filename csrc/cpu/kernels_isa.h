@@ -39,18 +39,18 @@ class Workspace {
 
 static thread_local Workspace workspace;
 
-// Calls f(marcher) with the degree and the opacity's kind resolved and room for the longest ray.
+// Calls f(marcher) with the degree and the opacity's kind resolved and room for a bundle of the longest rays.
 template <class Real, class F>
 void with_marcher(const Field<Real>& field, const RaySettings<Real>& settings, const F& f) {
   const int64_t capacity = trace_capacity(field, settings.step);
   const auto with_opacity = [&](const auto& opacity) {
     using Opacity = std::decay_t<decltype(opacity)>;
-    const size_t sample_bytes = capacity * sizeof(Sample<Real, Opacity>);
-    char* memory = workspace.reserve(sample_bytes + capacity / kLanes * sizeof(Footprints<Real>) + 64);
+    const size_t room = capacity * kBundle, sample_bytes = room * sizeof(Sample<Real, Opacity>);
+    char* memory = workspace.reserve(sample_bytes + room / kLanes * sizeof(Footprints<Real>) + 64);
     const Trace<Real, Opacity> trace{reinterpret_cast<Sample<Real, Opacity>*>(memory),
                                      reinterpret_cast<Footprints<Real>*>(memory + (sample_bytes + 63) / 64 * 64)};
     with_degree(field.pitch, [&](auto degree) {
-      f(Marcher<Real, decltype(degree)::value, Opacity>(field, settings, opacity, trace));
+      f(Marcher<Real, decltype(degree)::value, Opacity>(field, settings, opacity, trace, capacity));
     });
   };
   if (settings.opacity == 0)
@@ -84,8 +84,7 @@ void photometric_step(const Field<Real>& field, const Rays<Real>& rays, const Ra
                       double* losses, Real* color, Real* transmittance, Real* gradient) {
   Real spare[32] = {};
   with_marcher(field, settings, [&](const auto& march) {
-    for (int64_t i = begin; i < end; ++i)
-      photometric_ray(march, rays, seen, loss, i, losses, color, transmittance, gradient, spare);
+    photometric_rays(march, rays, seen, loss, begin, end, losses, color, transmittance, gradient, spare);
   });
 }
 

@@ -17,7 +17,7 @@ from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.rays import RayBatch, find_ranges
 from torch_surfcap.fitting.settings import FitSettings
 
-REFRESH = 8  # iterations after which the integration ranges are found anew: a surface moves by less than a voxel in them
+REFRESH = 8.0  # iterations at full rate after which the integration ranges are found anew: less than a voxel of motion
 GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
 GROUPS = (4, 32)  # fewest, most
 PARSIMONY_HUBER = 0.1
@@ -88,9 +88,10 @@ def descend(
     adam = TileAdam(store, settings.opacity, settings.descent)
     rule = Plateau(limit=3 * iterations)
     watch = Stopwatch(seconds)
-    goes_on = True
+    goes_on, moved = True, 0.0
     while goes_on:
-        if rule.count and rule.count % REFRESH == 0:
+        if moved >= REFRESH:
+            moved = 0.0
             rays.ranges = find_ranges(store, grid, settings.opacity, march, *bundle)
             watch.lap("ranges")
         shift = (torch.rand(len(rays), generator=generator) - 0.5) * settings.descent.jitter
@@ -114,6 +115,7 @@ def descend(
         )
         watch.lap("voxels")
         adam.step(gradient, rule.scale)
+        moved += rule.scale
         watch.lap("adam")
         losses = torch.cat([ray_losses, voxel_losses])
         total = float(losses @ weights)

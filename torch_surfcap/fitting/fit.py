@@ -12,6 +12,7 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.checks import prepare
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SLOPE, SurfaceField
 from torch_surfcap.fitting.budget import Budget, estimate, shortage
@@ -79,6 +80,7 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
         raise InputError(f"device: found {s.device}, expected cpu: this build has no CUDA kernels")
     seconds: dict[str, Any] = {}
     watch = Stopwatch(seconds)
+    capture = prepare(capture)
     degree = DEFAULT_DEGREE if s.sh_degree is None else s.sh_degree
     box = subject_box(capture, s.box)
     plan = plan_levels(capture, box, s.voxel, s.levels)
