@@ -129,6 +129,8 @@ def voxel_centers(grid: TileGrid, tiles: slice = slice(None)) -> Tensor:
 def with_skips(table: Tensor) -> Tensor:
     """``table`` with every outside entry turned into OUTSIDE - d, d the distance in cells (Chebyshev) to the nearest
     cell that is not empty, so that the march can leave empty space in long strides. Values mean the same."""
+    if table.dim() != 3:
+        raise ValueError(f"table: expected int32 [X+2, Y+2, Z+2], got {table.dtype} {list(table.shape)}")
     occupied = (table > OUTSIDE).cpu().numpy()
     cell = occupied.copy()  # a cell is empty if the tiles t .. t + 1 are outside
     for axis in range(3):
