@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -82,6 +83,15 @@ def test_one_wrong_camera_is_named(scene: Path, tmp_path: Path) -> None:
     status, lines = findings(changed(scene, tmp_path / "data", pose), tmp_path / "out")
     assert status == 1
     assert any(line.startswith("camera train/005 alone keeps") for line in lines)
+
+
+def test_one_dark_picture_is_named(scene: Path, tmp_path: Path) -> None:
+    data = changed(scene, tmp_path / "data", lambda M, i: M)
+    path = str(data / "train/003.png")
+    assert cv2.imwrite(path, cv2.imread(path) // 6)
+    status, lines = findings(data, tmp_path / "out")
+    assert status == 1
+    assert [line[:18] for line in lines] == ["camera train/003: "]
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

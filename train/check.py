@@ -33,9 +33,8 @@ from torch_surfcap.field.hull import find_box
 
 FILLED = 0.95  # less than this share of the silhouettes filled on average is a finding
 FILLED_ONE = 0.85  # ... and less than this of one camera's
-EXPOSURE = (
-    1.4  # so many times brighter or darker than the median camera is worth a note: exposure, or a dark side
-)
+UNEVEN = 1.4  # so many times brighter or darker than the median camera is worth a note
+EXPOSURE = 4.0  # ... and so many times is a finding
 AXES = 0.06  # length of the drawn frusta, relative to the distance between cameras and box
 
 
@@ -106,11 +105,7 @@ def examine(capture: Capture, box: tuple[Tensor, Tensor] | None = None) -> Check
                 f"camera {capture.names[worst]}: the hull fills {share:.2f} of its silhouette"
             )
         check.hull = soundness.hull_mesh(capture, check.box)
-    for name, ratio in zip(capture.names, check.exposure.tolist(), strict=True):
-        if not 1 / EXPOSURE <= ratio <= EXPOSURE:
-            check.findings.append(
-                f"camera {name}: its subject is {ratio:.2f} times as bright as the median camera's"
-            )
+    _compare_brightness(check)
     cut = [
         name for name, mask in zip(capture.names, capture.masks or [], strict=True) if _touches_border(mask)
     ]
@@ -119,6 +114,22 @@ def examine(capture: Capture, box: tuple[Tensor, Tensor] | None = None) -> Check
             f"{len(cut)} of {len(capture)} silhouettes touch the picture's border (first: {cut[0]})"
         )
     return check
+
+
+def _compare_brightness(check: Check) -> None:
+    """A note where pictures differ in brightness, a finding where one differs by more than lamps explain."""
+    names, ratios = check.capture.names, check.exposure
+    dark, bright = int(ratios.argmin()), int(ratios.argmax())
+    if ratios[bright] > UNEVEN or ratios[dark] < 1 / UNEVEN:
+        check.notes.append(
+            f"the subject is {float(ratios[dark]):.2f} (camera {names[dark]}) to {float(ratios[bright]):.2f} "
+            f"(camera {names[bright]}) times as bright as in the median camera: exposures differ, or its sides do"
+        )
+    for name, ratio in zip(names, ratios.tolist(), strict=True):
+        if not 1 / EXPOSURE <= ratio <= EXPOSURE:
+            check.findings.append(
+                f"camera {name}: its subject is {ratio:.2f} times as bright as the median camera's"
+            )
 
 
 def _explain(check: Check, filled: float) -> None:
