@@ -87,8 +87,7 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
     pictures = [capture]
     while len(pictures) <= plan[0].halvings:
         pictures.append(pictures[-1].halved())
-    # With plates the picture itself is explained; with masks alone the subject is set before one colour.
-    backdrop = None if capture.mask_source == "plate" else choose_backdrop(capture)
+    backdrop = choose_backdrop(capture)
     grid, store = first_field(pictures[plan[0].halvings], box, plan[0].voxel_size, s.opacity, degree)
     watch.lap("hull")
     budget = estimate(capture, plan, grid, store)

@@ -104,10 +104,18 @@ def _blocked(index: Tensor) -> Tensor:
     return index[(block * BLOCK * BLOCK + (row % BLOCK) * BLOCK + column % BLOCK).argsort()]
 
 
-def choose_backdrop(capture: Capture) -> Tensor:
-    """[3], the corner of the colour cube farthest from the subject's colours: the one whose nearest tenth of the
-    subject's pixels is farthest away."""
+def choose_backdrop(capture: Capture) -> Tensor | None:
+    """[3], the colour before which the subject is set, None where plates explain the whole picture.
+
+    Silhouettes that were found on a black background take shadows on the subject for background now and then: black, such
+    a mistake does little harm. Else it is the corner of the colour cube farthest from the subject's colours, namely the
+    one whose nearest tenth of the subject's pixels is farthest away.
+    """
     assert capture.masks is not None
+    if capture.mask_source == "plate":
+        return None
+    if capture.mask_source == "threshold":
+        return torch.zeros(3)
     colors = []
     for i, mask in enumerate(capture.masks):
         subject = capture.photograph(i)[mask > 0.9]
