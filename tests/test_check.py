@@ -88,7 +88,9 @@ def test_one_wrong_camera_is_named(scene: Path, tmp_path: Path) -> None:
 def test_one_dark_picture_is_named(scene: Path, tmp_path: Path) -> None:
     data = changed(scene, tmp_path / "data", lambda M, i: M)
     path = str(data / "train/003.png")
-    assert cv2.imwrite(path, cv2.imread(path) // 6)
+    picture = cv2.imread(path)
+    assert picture is not None
+    assert cv2.imwrite(path, np.asarray(picture, dtype=np.uint8) // np.uint8(6))
     status, lines = findings(data, tmp_path / "out")
     assert status == 1
     assert [line[:18] for line in lines] == ["camera train/003: "]
