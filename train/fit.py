@@ -224,9 +224,9 @@ def _summary(metrics: dict[str, Any], out: Path) -> None:
         if name in metrics[splits[0]]:
             print(f"{title:<14}" + "".join(f"{metrics[split][name]:>8.4g}" for split in splits))
     seconds = metrics["seconds"]
-    stages = ", ".join(f"{name} {value:.1f}" for name, value in seconds.items() if isinstance(value, float))
+    stages = [f"{name} {value:.1f}" for name, value in seconds.items() if name not in ("total", "levels")]
     print(f"triangles      {metrics['triangles']}")
-    print(f"seconds        {seconds['total']:.1f} ({stages})")
+    print(f"seconds        {seconds['total']:.1f} ({', '.join(stages)})")
     print(f"memory         {metrics['peak_memory_bytes'] / 2**30:.2f} GiB")
     print(f"files          {out}: {', '.join(RESULTS)}")
 
