@@ -44,6 +44,7 @@ class Scene(NamedTuple):
     frame: list[float]
     rays: tuple[Tensor, Tensor, Tensor, Tensor]  # origins, directions, shift, background
     seen: tuple[Tensor, Tensor, Tensor]  # target, mask, weight
+    gradients: Tensor  # memory of the partial gradients, which a fit keeps from step to step
 
     def field_and_rays(self) -> list[Any]:
         """What the arguments of the ops begin with."""
@@ -101,6 +102,7 @@ def make_scene(degree: int, pixels: int, cameras: int) -> Scene:
         frame,
         (start, directions, torch.zeros(rays), uniform[0]),
         (uniform[1], uniform[2], torch.ones(rays)),
+        voxels.new_empty(ops.GROUPS, *voxels.shape),
     )
 
 
@@ -110,8 +112,8 @@ def fused_forward(scene: Scene) -> Tensor:
 
 def fused_step(scene: Scene) -> Result:
     """This library's step."""
-    loss: list[Any] = [HUBER, WEIGHTS, False, ops.GROUPS]
-    losses, gradient, _, _ = ops.photometric_step(*[*scene.field_and_rays(), *scene.seen, *MARCH, *loss])
+    arguments: list[Any] = [*scene.field_and_rays(), *scene.seen, *MARCH, HUBER, WEIGHTS]
+    losses, gradient, _, _ = ops.photometric_step(*arguments, gradients=scene.gradients)
     return losses, gradient
 
 

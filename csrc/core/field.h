@@ -21,6 +21,7 @@ constexpr int kLanes = 8;  // samples set up together
 template <class Real> struct Footprints {
   int32_t voxel[8][kLanes];
   Real weight[8][kLanes];
+  int32_t least[kLanes];  // of the 8 indices: not negative where every corner is stored
 };
 
 // Positions u[axis] of kLanes points -> footprints.
@@ -46,14 +47,17 @@ SURFCAP_HD void locate(const Field<Real>& field, const Pack<Real, kLanes> (&u)[3
       local[axis][side] = ((base + side) & 3) * inner[axis];
     }
   }
+  Index least = fill_pack<int32_t, kLanes>(0);
   for (int c = 0; c < 8; ++c) {
     const int cx = c >> 2, cy = (c >> 1) & 1, cz = c & 1;
     const Index t = look_up<kLanes>(field.table, tile[0][cx] + tile[1][cy] + tile[2][cz]);
     // A stored tile has voxel >= t, a missing one (t < 0) voxel <= t: the greater is the index, or t's own meaning.
     const Index voxel = t * kTileVoxels + (local[0][cx] + local[1][cy] + local[2][cz]);
     store<int32_t, kLanes>(out.voxel[c], larger_pack<int32_t, kLanes>(t, voxel));
+    least = smaller_pack<int32_t, kLanes>(least, t);
     store<Real, kLanes>(out.weight[c], weight[0][cx] * weight[1][cy] * weight[2][cz]);
   }
+  store<int32_t, kLanes>(out.least, least);
 }
 
 // Asks for the records that the first `count` lanes will read from, or add to, `records`. On CUDA the many threads of a
@@ -66,27 +70,32 @@ SURFCAP_HD void prefetch(const Real* records, const Footprints<Real>& at, int co
   // Small records of one column along z share a cache line most of the time.
   constexpr int kStride = R::kPitch * 2 <= kLine ? 2 : 1;
   for (int l = 0; l < count; ++l)
-    for (int c = 0; c < 8; c += kStride) {
-      const int32_t voxel = larger(at.voxel[c][l], 0);
-      for (int i = 0; i < R::kPitch; i += kLine) __builtin_prefetch(records + int64_t(voxel) * R::kPitch + i);
-    }
+    for (int c = 0; c < 8; c += kStride)  // a negative index asks for a line before the records: a hint, no access
+      for (int i = 0; i < R::kPitch; i += kLine)
+        __builtin_prefetch(records + int64_t(at.voxel[c][l]) * R::kPitch + i);
 #endif
 }
 
 // The trilinear read of lane l: sum of weight times record over the 8 corners. A missing corner is black and has the
-// boundary's opacity value; it reads a constant record instead, so that the loop has no branch on the data.
+// boundary's opacity value: it reads a constant record instead.
 template <class Real, int Degree>
 SURFCAP_HD Coefficients<Real, Degree> interpolate(const Field<Real>& field, const Real* missing_records,
                                                   const Footprints<Real>& at, int l) {
   using R = Record<Degree>;
   Coefficients<Real, Degree> sum;
   for (int p = 0; p < R::kParts; ++p) sum.part[p] = zero_pack<Real, R::kPart>();
-  for (int c = 0; c < 8; ++c) {
-    const int32_t voxel = at.voxel[c][l];
-    const Real* record = voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch
-                                    : missing_records + (voxel == kInside ? R::kPitch : 0);
-    for (int p = 0; p < R::kParts; ++p)
-      sum.part[p] += at.weight[c][l] * load<Real, R::kPart>(record + p * R::kPart);
+  const auto add = [&](const Real* record, Real weight) {
+    for (int p = 0; p < R::kParts; ++p) sum.part[p] += weight * load<Real, R::kPart>(record + p * R::kPart);
+  };
+  if (at.least[l] >= 0) {
+    for (int c = 0; c < 8; ++c) add(field.voxels + int64_t(at.voxel[c][l]) * R::kPitch, at.weight[c][l]);
+  } else {
+    for (int c = 0; c < 8; ++c) {
+      const int32_t voxel = at.voxel[c][l];
+      add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch
+                     : missing_records + (voxel == kInside ? R::kPitch : 0),
+          at.weight[c][l]);
+    }
   }
   return sum;
 }
@@ -104,12 +113,18 @@ template <class Real, int Degree>
 SURFCAP_HD void scatter(Real* gradient, Real* spare, const Footprints<Real>& at, int l,
                         const Coefficients<Real, Degree>& g) {
   using R = Record<Degree>;
-  for (int c = 0; c < 8; ++c) {
-    const int32_t voxel = at.voxel[c][l];
-    Real* record = voxel >= 0 ? gradient + int64_t(voxel) * R::kPitch : spare;
+  const auto add = [&](Real* record, Real weight) {
     for (int p = 0; p < R::kParts; ++p) {
-      Real* to = record + p * R::kPart;
-      store<Real, R::kPart>(to, load<Real, R::kPart>(to) + at.weight[c][l] * g.part[p]);
+      Real* const to = record + p * R::kPart;
+      store<Real, R::kPart>(to, load<Real, R::kPart>(to) + weight * g.part[p]);
+    }
+  };
+  if (at.least[l] >= 0) {
+    for (int c = 0; c < 8; ++c) add(gradient + int64_t(at.voxel[c][l]) * R::kPitch, at.weight[c][l]);
+  } else {
+    for (int c = 0; c < 8; ++c) {
+      const int32_t voxel = at.voxel[c][l];
+      add(voxel >= 0 ? gradient + int64_t(voxel) * R::kPitch : spare, at.weight[c][l]);
     }
   }
 }
