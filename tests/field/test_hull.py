@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.fitting.sphere import CENTER, RADIUS, photographed, ring
+from tests.fitting.sphere import CENTER, RADIUS, ball, photographed, ring
 from torch_surfcap import Cameras, Capture, InputError
 from torch_surfcap.field.hull import Silhouettes, find_box, grown, pixel_footprint
 
@@ -63,7 +63,7 @@ def test_equals_kornia_and_grid_sample(offset: float) -> None:
 
 
 def test_hull_of_no_points() -> None:
-    assert Silhouettes.of(photographed(ring(3))).hull(torch.zeros(0, 4, 3)).shape == (0, 4)
+    assert Silhouettes.of(ball(3)).hull(torch.zeros(0, 4, 3)).shape == (0, 4)
 
 
 def test_grown_by_hand() -> None:
@@ -87,7 +87,7 @@ def lattice(reach: float, count: int = 60) -> Tensor:
 
 def test_phantoms_are_left_out() -> None:
     """Beside the view of most cameras two of them agree on solids that nobody denies; they are no part of the hull."""
-    silhouettes = Silhouettes.of(photographed(ring()))
+    silhouettes = Silhouettes.of(ball())
     points = lattice(1.2)
     everything, kept = silhouettes.hull(points) > 0.5, silhouettes.occupied(points)
     radius = (points - center).norm(dim=-1)
@@ -152,7 +152,7 @@ def wrong(capture: Capture, message: str) -> None:
 
 
 def test_no_box_is_said_in_one_line() -> None:
-    good = photographed(ring(6))
+    good = ball(6)
     assert good.masks is not None
     away = good.cameras.world_to_camera.clone()
     away[:, 2] *= -1  # the cameras look away from one another

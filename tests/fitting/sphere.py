@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -77,3 +78,9 @@ def photographed(cameras: Cameras, plates: bool = False) -> Capture:
     capture = Capture(images, cameras.K, cameras.world_to_camera, masks, backdrops if plates else None)
     capture.mask_source = "plate" if plates else "file"
     return capture
+
+
+@functools.cache
+def ball(views: int = 12, side: int = 64, plates: bool = False) -> Capture:
+    """The ball from a full ring, made once: not to be changed."""
+    return photographed(ring(views, side=side), plates)

@@ -38,7 +38,7 @@ def prepare(capture: Capture) -> Capture:
         )
     if test is not None:
         test = _find_masks(test)
-        kept_test = _leave_out(test, _faults(test, subject=_meeting_point(kept)))
+        kept_test = _leave_out(test, _faults(test, subject=meeting_point(kept)))
         kept.warnings += [f"held out: {line}" for line in kept_test.warnings]
         kept_test.prepared = True
         kept.test = kept_test if len(kept_test) else None
@@ -84,7 +84,7 @@ def _faults(capture: Capture, subject: Tensor | None = None) -> dict[int, str]:
             faults[i] = why
     good = [i for i in range(len(capture)) if i not in faults]
     if subject is None and len(good) >= FEWEST:
-        subject = _meeting_point(capture.subset(good))
+        subject = meeting_point(capture.subset(good))
     if subject is not None:
         away = {i: why for i in good if (why := _pose_fault(capture, i, subject))}
         # where many cameras seem to look elsewhere the convention is wrong, not the cameras: train/check.py tells
@@ -126,7 +126,7 @@ def _sight(capture: Capture, i: int) -> tuple[Tensor, Tensor]:
     return origins[0], directions[0]
 
 
-def _meeting_point(capture: Capture) -> Tensor:
+def meeting_point(capture: Capture) -> Tensor:
     """[3] the point nearest to all cameras' lines to the middle of their masks.
 
     Nearest by the sum of distances, not of their squares, so that one wrong camera does not move it.

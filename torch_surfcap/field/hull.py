@@ -19,6 +19,7 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.checks import meeting_point
 from torch_surfcap.errors import InputError
 
 CHUNK = 1 << 20  # points a call, to bound the memory
@@ -124,30 +125,24 @@ def find_box(capture: Capture) -> tuple[Tensor, Tensor]:
 
 
 def _first_guess(capture: Capture) -> tuple[Tensor, float]:
-    """A cube that holds the hull: the point nearest to the rays through the masks' centres, and how far the subject
-    reaches around it as the cameras see it."""
+    """A cube that holds the hull: the point where the cameras' looks meet, and twice how far the silhouettes reach around
+    it as the cameras see them (the median over the cameras)."""
     cameras = capture.cameras
-    normal, moment = torch.zeros(3, 3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    extents = []
     assert capture.masks is not None
+    for name, mask in zip(capture.names, capture.masks, strict=True):
+        if not (mask > 0.5).any():
+            raise InputError(f"mask of camera {name}: empty, expected a silhouette")
+    center = meeting_point(capture)
+    reach = []
     for i, mask in enumerate(capture.masks):
-        v, u = (mask > 0.5).nonzero().double().unbind(1)
-        if len(u) == 0:
-            raise InputError(f"mask of camera {capture.names[i]}: empty, expected a silhouette")
-        middle = torch.stack([u.mean() + 0.5, v.mean() + 0.5])
-        origin, direction = cameras.rays(i, middle[None])
-        projector = torch.eye(3, dtype=torch.float64) - direction[0, :, None] * direction[0]
-        normal += projector
-        moment += projector @ origin[0]
-        corners = torch.tensor(
-            [[u.min(), v.min()], [u.max(), v.min()], [u.min(), v.max()], [u.max(), v.max()]]
-        )
-        _, directions = cameras.rays(i, corners.double() + 0.5)
-        cosine = (directions @ direction[0]).amin().clamp(0.1, 1.0)
-        extents.append(float(torch.sqrt(1 / cosine**2 - 1)))
-    center = torch.linalg.lstsq(normal, moment).solution
-    distance = (center - cameras.centers).norm(dim=1)
-    return center, 2.0 * float((distance * torch.tensor(extents, dtype=torch.float64)).median())
+        subject = mask > 0.5
+        v, u = (subject.any(axis).nonzero()[:, 0].double() for axis in (1, 0))
+        corners = torch.cartesian_prod(torch.stack([u[0], u[-1] + 1]), torch.stack([v[0], v[-1] + 1]))
+        toward = center - cameras.centers[i]
+        _, directions = cameras.rays(i, corners)
+        cosine = (directions @ toward / toward.norm()).amin().clamp(0.1, 1.0)
+        reach.append(toward.norm() * torch.sqrt(1 / cosine**2 - 1))
+    return center, 2.0 * float(torch.stack(reach).median())
 
 
 def _lattice(low: Tensor, high: Tensor, cell: float) -> tuple[Tensor, Tensor]:
