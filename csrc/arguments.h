@@ -75,8 +75,7 @@ template <class Number> class Input {
 };
 
 // A tensor that an op writes into: no copy may stand between.
-template <class Number>
-Number* output(const char* name, const Tensor& t, Shape shape) {
+template <class Number> Number* output(const char* name, const Tensor& t, Shape shape) {
   check_shape(name, t, shape);
   STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name);
   STD_TORCH_CHECK(t.is_contiguous(), name, ": is written in place and must be contiguous");
@@ -151,15 +150,14 @@ template <class Real> struct RangesArgument {
   }
 };
 
-template <class Real>
-RaySettings<Real> ray_settings(int64_t opacity, double slope, double step, double stop) {
+template <class Real> RaySettings<Real> ray_settings(int64_t opacity, double slope, double step, double stop) {
   STD_TORCH_CHECK(opacity == 0 || opacity == 1, "opacity: expected 0 (transparency) or 1 (distance), got ", opacity);
   STD_TORCH_CHECK(step > 0, "step: expected a positive length, got ", step);
   return {Real(step), Real(stop), Real(slope), int32_t(opacity)};
 }
 
 // Runs f<float> or f<double> by the type of `t`.
-#define SURFCAP_BY_TYPE(t, f, ...)                                                       \
+#define SURFCAP_BY_TYPE(t, f, ...) \
   ((t).scalar_type() == ScalarType::Double ? f<double>(__VA_ARGS__) : f<float>(__VA_ARGS__))
 
 }  // namespace surfcap

@@ -5,11 +5,7 @@
 #include <Python.h>
 
 static struct PyModuleDef module = {
-    PyModuleDef_HEAD_INIT,
-    "_C",
-    "Loads the compiled operators of torch_surfcap into torch.ops.torch_surfcap.",
-    0,
-    NULL,
+    PyModuleDef_HEAD_INIT, "_C", "Loads the compiled operators of torch_surfcap into torch.ops.torch_surfcap.", 0, NULL,
 };
 
 PyMODINIT_FUNC PyInit__C(void) { return PyModule_Create(&module); }

@@ -12,15 +12,17 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
   m.def("march_forward(" FIELD ", " RAYS ", " MARCH ") -> (Tensor, Tensor, Tensor)");
   m.def("march_backward(Tensor grad_color, Tensor grad_transmittance, Tensor grad_depth, " FIELD ", " RAYS ", " MARCH
         ", int groups) -> Tensor");
-  m.def("photometric_step(" FIELD ", " RAYS ", Tensor target, Tensor mask, Tensor weight, "
-        "Tensor? range_offsets, Tensor? ranges, " MARCH ", float huber, float[] weights, bool detach_sample, Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
+  m.def("photometric_step(" FIELD ", " RAYS
+        ", Tensor target, Tensor mask, Tensor weight, "
+        "Tensor? range_offsets, Tensor? ranges, " MARCH
+        ", float huber, float[] weights, bool detach_sample, Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
   m.def("integration_ranges(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH
         ", float quiet) -> (Tensor, Tensor)");
   m.def("visibility(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH ", int groups) -> Tensor");
-  m.def("voxel_terms(" FIELD
-        ", Tensor coordinates, float[] weights, float huber, Tensor(a!) gradient) -> Tensor");
-  m.def("adam_step(Tensor(a!) voxels, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor low, "
-        "Tensor high, float beta1, float beta2, float epsilon, int t) -> ()");
+  m.def("voxel_terms(" FIELD ", Tensor coordinates, float[] weights, float huber, Tensor(a!) gradient) -> Tensor");
+  m.def(
+      "adam_step(Tensor(a!) voxels, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor low, "
+      "Tensor high, float beta1, float beta2, float epsilon, int t) -> ()");
   m.def("soft_hull(Tensor points, Tensor projections, Tensor masks, Tensor sizes) -> (Tensor, Tensor)");
   m.def("upscale(" FIELD ", Tensor fine_coordinates, float[] fine_frame) -> Tensor");
 }

@@ -6,4 +6,13 @@ from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import RayOutput, SurfaceField
 from torch_surfcap.fitting.fit import FitResult, fit
 
-__all__ = ["Cameras", "Capture", "FitResult", "InputError", "RayOutput", "SurfaceField", "fit", "load_capture"]
+__all__ = [
+    "Cameras",
+    "Capture",
+    "FitResult",
+    "InputError",
+    "RayOutput",
+    "SurfaceField",
+    "fit",
+    "load_capture",
+]

@@ -119,7 +119,15 @@ class PhotometricStep(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rays, seen = (origins, directions, shift, background), (target, mask, weight)
         losses, gradient, color, transmittance = ops.photometric_step(
-            voxels, table, frame, *rays, *seen, *march, huber, weights, detach_sample
+            voxels,
+            table,
+            frame,
+            *rays,
+            *seen,
+            **march._asdict(),
+            huber=huber,
+            weights=weights,
+            detach_sample=detach_sample,
         )
         ctx.save_for_backward(gradient)
         ctx.mark_non_differentiable(losses, color, transmittance)
@@ -160,4 +168,3 @@ class VoxelTerms(torch.autograd.Function):
     def backward(ctx: Any, by_total: Tensor, *unused: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
         return (by_total * gradient if ctx.needs_input_grad[0] else None, *[None] * 5)
-

@@ -52,7 +52,9 @@ def degree_of(count: int) -> int:
     for sh_degree in range(3):
         if count in (coefficients(sh_degree), pitch(sh_degree)):
             return sh_degree
-    raise ValueError(f"voxels: expected 4, 13, 16, 28 or 32 numbers per voxel (SH degree 0, 1, 2), got {count}")
+    raise ValueError(
+        f"voxels: expected 4, 13, 16, 28 or 32 numbers per voxel (SH degree 0, 1, 2), got {count}"
+    )
 
 
 def padded(voxels: Tensor) -> Tensor:
@@ -67,7 +69,12 @@ def sample_forward(voxels: Tensor, table: Tensor, frame: list[float], points: Te
 
 
 def sample_backward(
-    grad_values: Tensor, voxels: Tensor, table: Tensor, frame: list[float], points: Tensor, groups: int = GROUPS
+    grad_values: Tensor,
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    points: Tensor,
+    groups: int = GROUPS,
 ) -> Tensor:
     """Adjoint of :func:`sample_forward` by the voxels: [T, 4, 4, 4, P]."""
     return cast(Tensor, _ops.sample_backward(grad_values, voxels, table, frame, points, groups))
@@ -89,7 +96,9 @@ def march_forward(
     """The ray integral (paper eq. 4 to 6 with the exclusive transmittance): colour [R, 3], transmittance [R] and depth
     [R] = sum w t / sum w, NaN where a ray meets nothing."""
     field, rays = (voxels, table, frame), (origins, directions, shift, background)
-    return cast("tuple[Tensor, Tensor, Tensor]", _ops.march_forward(*field, *rays, opacity, slope, step, stop))
+    return cast(
+        "tuple[Tensor, Tensor, Tensor]", _ops.march_forward(*field, *rays, opacity, slope, step, stop)
+    )
 
 
 def march_backward(
@@ -153,12 +162,18 @@ def photometric_step(
         losses [3] float64, not yet times ``weights``; the gradient of ``weights . losses`` [T, 4, 4, 4, P]; the colours
         [R, 3] and transmittances [R] of the rays.
     """
-    field, rays, seen = (voxels, table, frame), (origins, directions, shift, background), (target, mask, weight)
+    field, rays, seen = (
+        (voxels, table, frame),
+        (origins, directions, shift, background),
+        (target, mask, weight),
+    )
     march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample)
     stretches = ranges or (None, None)
     if gradients is None:
         gradients = voxels.new_empty(groups, *voxels.shape)
-    losses, color, transmittance = _ops.photometric_step(*field, *rays, *seen, *stretches, *march, *loss, gradients)
+    losses, color, transmittance = _ops.photometric_step(
+        *field, *rays, *seen, *stretches, *march, *loss, gradients
+    )
     return losses, gradients[0], color, transmittance
 
 

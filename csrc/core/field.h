@@ -62,8 +62,7 @@ SURFCAP_HD void locate(const Field<Real>& field, const Pack<Real, kLanes> (&u)[3
 
 // Asks for the records that the first `count` lanes will read from, or add to, `records`. On CUDA the many threads of a
 // multiprocessor hide the wait instead.
-template <class Real, int Degree>
-SURFCAP_HD void prefetch(const Real* records, const Footprints<Real>& at, int count) {
+template <class Real, int Degree> SURFCAP_HD void prefetch(const Real* records, const Footprints<Real>& at, int count) {
 #if !defined(__CUDACC__)
   using R = Record<Degree>;
   constexpr int kLine = 64 / sizeof(Real);
@@ -71,8 +70,7 @@ SURFCAP_HD void prefetch(const Real* records, const Footprints<Real>& at, int co
   constexpr int kStride = R::kPitch * 2 <= kLine ? 2 : 1;
   for (int l = 0; l < count; ++l)
     for (int c = 0; c < 8; c += kStride)  // a negative index asks for a line before the records: a hint, no access
-      for (int i = 0; i < R::kPitch; i += kLine)
-        __builtin_prefetch(records + int64_t(at.voxel[c][l]) * R::kPitch + i);
+      for (int i = 0; i < R::kPitch; i += kLine) __builtin_prefetch(records + int64_t(at.voxel[c][l]) * R::kPitch + i);
 #endif
 }
 
@@ -92,8 +90,7 @@ SURFCAP_HD Coefficients<Real, Degree> interpolate(const Field<Real>& field, cons
   } else {
     for (int c = 0; c < 8; ++c) {
       const int32_t voxel = at.voxel[c][l];
-      add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch
-                     : missing_records + (voxel == kInside ? R::kPitch : 0),
+      add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch : missing_records + (voxel == kInside ? R::kPitch : 0),
           at.weight[c][l]);
     }
   }

@@ -2,8 +2,8 @@
 // the step between a voxel's coefficients and one sample's (opacity, r, g, b).
 //
 // A voxel's record is [opacity, b00 r g b, b1 r g b, ...], padded to 4, 16 or 32 numbers for degree 0, 1, 2. Along one
-// ray the basis is constant, so it is laid out once in the order of the record ("weights" below) and colour is a product
-// followed by a fold of the channels.
+// ray the basis is constant, so it is laid out once in the order of the record ("weights" below) and colour is a
+// product followed by a fold of the channels.
 #pragma once
 
 #include "pack.h"
@@ -91,8 +91,7 @@ SURFCAP_HD Pack<Real, 4> fold(const Coefficients<Real, Degree>& c, const Coeffic
     return add_quarters<Real>(__builtin_shufflevector(v, v, 0, 1, 2, 3, 13, 4, 5, 6, 13, 7, 8, 9, 13, 10, 11, 12));
   } else {
     const Pack<Real, 16> lo = c.part[0] * w.part[0], hi = c.part[1] * w.part[1];
-    const Pack<Real, 16> first =
-        __builtin_shufflevector(lo, hi, 0, 1, 2, 3, 28, 4, 5, 6, 28, 7, 8, 9, 28, 10, 11, 12);
+    const Pack<Real, 16> first = __builtin_shufflevector(lo, hi, 0, 1, 2, 3, 28, 4, 5, 6, 28, 7, 8, 9, 28, 10, 11, 12);
     const Pack<Real, 16> second =
         __builtin_shufflevector(lo, hi, 28, 13, 14, 15, 28, 16, 17, 18, 28, 19, 20, 21, 28, 22, 23, 24);
     const Pack<Real, 4> last = __builtin_shufflevector(hi, hi, 12, 9, 10, 11);

@@ -78,7 +78,11 @@ template <class Real> class Lattice {
  public:
   Lattice() = default;
   SURFCAP_HD Lattice(const Cells<Real>& cells, Real step, Real shift, const Real* ranges, int32_t range_count)
-      : cells_(cells), ranges_(ranges), left_(range_count), step_(step), per_step_(Real(1) / step),
+      : cells_(cells),
+        ranges_(ranges),
+        left_(range_count),
+        step_(step),
+        per_step_(Real(1) / step),
         offset_(Real(0.5) + shift) {
     const bool hit = cells.near < cells.far;
     k_ = hit ? larger(index_after(cells.near), 0) : 0;

@@ -42,8 +42,8 @@ template <class Real> SURFCAP_HD int64_t trace_capacity(const Field<Real>& field
   return (longest / kLanes + 2) * kLanes;
 }
 
-// The walk forward. It comes in two parts so that several rays can be in flight: `start` finds the first samples and asks
-// for what they read, `finish` goes through all samples.
+// The walk forward. It comes in two parts so that several rays can be in flight: `start` finds the first samples and
+// asks for what they read, `finish` goes through all samples.
 template <class Real, int Degree, class Opacity> struct Walk {
   Lattice<Real> lattice;
   Coefficients<Real, Degree> weights;
@@ -140,8 +140,7 @@ SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const 
     g[0] = by_a * by_current;
     g += carried;
     carried = to_previous;
-    scatter<Real, Degree>(gradient, spare, trace.footprints[i / kLanes], i % kLanes,
-                          unfold<Real, Degree>(g, weights));
+    scatter<Real, Degree>(gradient, spare, trace.footprints[i / kLanes], i % kLanes, unfold<Real, Degree>(g, weights));
   }
 }
 

@@ -27,9 +27,9 @@ template <class Real> struct Transparency {
   }
 };
 
-// A signed distance s in voxels, positive outside. With the logistic Phi(s) = 1/(1 + E), E = exp(-slope s), the interval
-// between two samples lets a = min(1, Phi_k / Phi_{k-1}) = min(1, (1 + E_{k-1}) / (1 + E_k)) through, and has the mean
-// of their colours. Before a run's first sample E = 0.
+// A signed distance s in voxels, positive outside. With the logistic Phi(s) = 1/(1 + E), E = exp(-slope s), the
+// interval between two samples lets a = min(1, Phi_k / Phi_{k-1}) = min(1, (1 + E_{k-1}) / (1 + E_k)) through, and has
+// the mean of their colours. Before a run's first sample E = 0.
 template <class Real> struct SignedDistance {
   static constexpr bool kMidpointColor = true;
   Real slope;

@@ -28,31 +28,35 @@ template <class Real, int N> struct PackStruct {
   Real lane[N];
   SURFCAP_HD Real& operator[](int i) { return lane[i]; }
   SURFCAP_HD Real operator[](int i) const { return lane[i]; }
-#define SURFCAP_PACK_OPERATOR(op)                                                                                      \
-  friend SURFCAP_HD PackStruct operator op(const PackStruct& a, const PackStruct& b) {                                 \
-    PackStruct r;                                                                                                      \
-    for (int i = 0; i < N; ++i) r.lane[i] = a.lane[i] op b.lane[i];                                                    \
-    return r;                                                                                                          \
-  }                                                                                                                    \
-  friend SURFCAP_HD PackStruct operator op(Real a, const PackStruct& b) {                                              \
-    PackStruct r;                                                                                                      \
-    for (int i = 0; i < N; ++i) r.lane[i] = a op b.lane[i];                                                            \
-    return r;                                                                                                          \
-  }                                                                                                                    \
-  friend SURFCAP_HD PackStruct operator op(const PackStruct& a, Real b) {                                              \
-    PackStruct r;                                                                                                      \
-    for (int i = 0; i < N; ++i) r.lane[i] = a.lane[i] op b;                                                            \
-    return r;                                                                                                          \
-  }                                                                                                                    \
-  SURFCAP_HD PackStruct& operator op##=(const PackStruct& b) { return *this = *this op b; }
+#define SURFCAP_PACK_OPERATOR(op)                                                      \
+  friend SURFCAP_HD PackStruct operator op(const PackStruct& a, const PackStruct& b) { \
+    PackStruct r;                                                                      \
+    for (int i = 0; i < N; ++i) r.lane[i] = a.lane[i] op b.lane[i];                    \
+    return r;                                                                          \
+  }                                                                                    \
+  friend SURFCAP_HD PackStruct operator op(Real a, const PackStruct& b) {              \
+    PackStruct r;                                                                      \
+    for (int i = 0; i < N; ++i) r.lane[i] = a op b.lane[i];                            \
+    return r;                                                                          \
+  }                                                                                    \
+  friend SURFCAP_HD PackStruct operator op(const PackStruct& a, Real b) {              \
+    PackStruct r;                                                                      \
+    for (int i = 0; i < N; ++i) r.lane[i] = a.lane[i] op b;                            \
+    return r;                                                                          \
+  }                                                                                    \
+  SURFCAP_HD PackStruct& operator op## = (const PackStruct& b) { return *this = *this op b; }
   SURFCAP_PACK_OPERATOR(+)
   SURFCAP_PACK_OPERATOR(-)
   SURFCAP_PACK_OPERATOR(*)
 #undef SURFCAP_PACK_OPERATOR
 };
-template <class Real, int N> struct PackOf { using type = PackStruct<Real, N>; };
+template <class Real, int N> struct PackOf {
+  using type = PackStruct<Real, N>;
+};
 #else
-template <class Real, int N> struct PackOf { typedef Real type __attribute__((vector_size(N * sizeof(Real)))); };
+template <class Real, int N> struct PackOf {
+  typedef Real type __attribute__((vector_size(N * sizeof(Real))));
+};
 #endif
 
 template <class Real, int N> using Pack = typename PackOf<Real, N>::type;

@@ -96,12 +96,13 @@ SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march,
   march.back(walk, r_inf, term, gradient, spare);
 }
 
-// One ray of the fused step, its walk forward done: adds (photo, sample, mask), each times the ray's weight, to `losses`, the gradient of their
-// weighted sum to `gradient`, and writes colour and transmittance.
+// One ray of the fused step, its walk forward done: adds (photo, sample, mask), each times the ray's weight, to
+// `losses`, the gradient of their weighted sum to `gradient`, and writes colour and transmittance.
 template <class Real, int Degree, class Opacity>
-SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march,
-                                const Walk<Real, Degree, Opacity>& walk, const Rays<Real>& rays, const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t i,
-                                double* losses, Real* color, Real* transmittance, Real* gradient, Real* spare) {
+SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, const Walk<Real, Degree, Opacity>& walk,
+                                const Rays<Real>& rays, const Observation<Real>& seen,
+                                const PhotometricSettings<Real>& loss, int64_t i, double* losses, Real* color,
+                                Real* transmittance, Real* gradient, Real* spare) {
   const RayResult<Real>& ray = walk.ray;
   const Pack<Real, 4> target = color_of(seen.target + 3 * i), background = color_of(rays.background + 3 * i);
   const Pack<Real, 4> rendered = ray.sum + ray.transmittance * background;
@@ -152,9 +153,9 @@ SURFCAP_HD void photometric_rays(const Marcher<Real, Degree, Opacity>& march, co
   }
 }
 
-// Integration ranges (paper, section 4.1) of ray i: the stretches [begin, end) of distance that are not as good as empty,
-// a step wider on either side than the samples whose value is under `quiet`, and two steps beyond where the ray ends.
-// Writes them to `out`, which has room for one per sample, and returns their number.
+// Integration ranges (paper, section 4.1) of ray i: the stretches [begin, end) of distance that are not as good as
+// empty, a step wider on either side than the samples whose value is under `quiet`, and two steps beyond where the ray
+// ends. Writes them to `out`, which has room for one per sample, and returns their number.
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real quiet,
                           Real* out) {

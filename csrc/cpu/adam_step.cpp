@@ -10,17 +10,22 @@ void adam_step_typed(const Tensor& voxels, const Tensor& gradient, const Tensor&
                      const Tensor& rate, const Tensor& low, const Tensor& high, double beta1, double beta2,
                      double epsilon, int64_t t) {
   const int64_t pitch = voxels.dim() == 5 ? voxels.size(4) : 0;
-  STD_TORCH_CHECK(pitch == 4 || pitch == 16 || pitch == 32,
-                  "voxels: expected [tiles, 4, 4, 4, 4 | 16 | 32], got ", shape_of(voxels));
+  STD_TORCH_CHECK(pitch == 4 || pitch == 16 || pitch == 32, "voxels: expected [tiles, 4, 4, 4, 4 | 16 | 32], got ",
+                  shape_of(voxels));
   STD_TORCH_CHECK(t >= 1, "t: expected a step counted from 1, got ", t);
   const Shape shape = {voxels.size(0), kTileSide, kTileSide, kTileSide, pitch};
   Real *const value = output<Real>("voxels", voxels, shape), *const m = output<Real>("first", first, shape),
               *const v = output<Real>("second", second, shape);
   const Input<Real> g("gradient", gradient, shape);
   const Input<Real> rates("rate", rate, {pitch}), lows("low", low, {pitch}), highs("high", high, {pitch});
-  const AdamSettings<Real> adam{Real(beta1), Real(beta2), Real(epsilon),
-                                Real(1 / (1 - std::pow(beta1, double(t)))), Real(1 / (1 - std::pow(beta2, double(t)))),
-                                rates.data(), lows.data(), highs.data()};
+  const AdamSettings<Real> adam{Real(beta1),
+                                Real(beta2),
+                                Real(epsilon),
+                                Real(1 / (1 - std::pow(beta1, double(t)))),
+                                Real(1 / (1 - std::pow(beta2, double(t)))),
+                                rates.data(),
+                                lows.data(),
+                                highs.data()};
   parallel_ranges(voxels.size(0) * kVoxelsPerTile, 4096, [&](int64_t begin, int64_t end) {
     best_kernels<Real>().adam_step(value, g.data(), m, v, int32_t(pitch), begin, end, adam);
   });

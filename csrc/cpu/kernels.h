@@ -1,5 +1,5 @@
-// The CPU kernels behind one table per instruction set. A kernel works on a range of rays, points, tiles or records; the
-// drivers beside this file split the work over threads.
+// The CPU kernels behind one table per instruction set. A kernel works on a range of rays, points, tiles or records;
+// the drivers beside this file split the work over threads.
 #pragma once
 
 #include <vector>

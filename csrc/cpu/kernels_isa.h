@@ -175,8 +175,8 @@ void sample_backward(const Field<Real>& field, const Real* points, const Real* g
 
 // The values of the fine tiles begin..end, read from the coarse field at the fine voxels' centres.
 template <class Real>
-void upscale(const Field<Real>& coarse, const Field<Real>& fine, const int32_t* coordinates, int64_t begin,
-             int64_t end, Real* voxels) {
+void upscale(const Field<Real>& coarse, const Field<Real>& fine, const int32_t* coordinates, int64_t begin, int64_t end,
+             Real* voxels) {
   const auto center = [&](int64_t i, Real* x) {
     const int v = int(i % kTileVoxels), place[3] = {v / (kTile * kTile), (v / kTile) % kTile, v % kTile};
     for (int axis = 0; axis < 3; ++axis) {
@@ -216,10 +216,10 @@ void soft_hull(const Silhouettes<Real>& silhouettes, const Real* points, int64_t
 
 namespace SURFCAP_ISA {
 template <class Real> const Kernels<Real>& kernels() {
-  static constexpr Kernels<Real> table{
-      SURFCAP_ISA_NAME,      sample_forward<Real>, sample_backward<Real>,  march_forward<Real>,
-      march_backward<Real>, photometric_step<Real>, integration_ranges<Real>, visibility<Real>, voxel_terms<Real>,
-      adam_step<Real>,       soft_hull<Real>,        upscale<Real>};
+  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,         sample_forward<Real>, sample_backward<Real>,
+                                       march_forward<Real>,      march_backward<Real>, photometric_step<Real>,
+                                       integration_ranges<Real>, visibility<Real>,     voxel_terms<Real>,
+                                       adam_step<Real>,          soft_hull<Real>,      upscale<Real>};
   return table;
 }
 template const Kernels<float>& kernels<float>();

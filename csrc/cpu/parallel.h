@@ -22,7 +22,8 @@ constexpr int64_t kChunk = 256;  // rays or points that one group takes at a tim
 inline void advise_large_pages(void* data, int64_t bytes) {
 #if defined(__linux__)
   constexpr uintptr_t kPage = uintptr_t(2) << 20;
-  const uintptr_t begin = (uintptr_t(data) + kPage - 1) / kPage * kPage, end = (uintptr_t(data) + bytes) / kPage * kPage;
+  const uintptr_t begin = (uintptr_t(data) + kPage - 1) / kPage * kPage,
+                  end = (uintptr_t(data) + bytes) / kPage * kPage;
   if (begin < end) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
 #endif
 }
@@ -30,7 +31,6 @@ inline void advise_large_pages(void* data, int64_t bytes) {
 template <class F> void parallel_ranges(int64_t count, int64_t grain, const F& f) {
   if (count > 0) torch::stable::parallel_for(0, count, grain, [&](int64_t begin, int64_t end) { f(begin, end); });
 }
-
 
 // Calls work(begin, end, buffer, group) for all chunks of 0..count, chunk c in group c mod groups, each group with its
 // own zeroed buffer of `size` numbers, the first being `total` and the others following one another in `rest`; then

@@ -1,6 +1,6 @@
-// photometric_step: photometric, sample and mask loss of many rays, and the gradient of their weighted sum, in one call.
-// The caller gives the memory for the partial gradients, because a fit uses the same in every iteration; fresh pages
-// would cost a third of the step.
+// photometric_step: photometric, sample and mask loss of many rays, and the gradient of their weighted sum, in one
+// call. The caller gives the memory for the partial gradients, because a fit uses the same in every iteration; fresh
+// pages would cost a third of the step.
 #include <tuple>
 
 #include "parallel.h"
@@ -13,10 +13,9 @@ template <class Real>
 StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
                                   const Tensor& origins, const Tensor& directions, const Tensor& shift,
                                   const Tensor& background, const Tensor& target, const Tensor& mask,
-                                  const Tensor& weight,
-                                  const std::optional<Tensor>& range_offsets, const std::optional<Tensor>& ranges,
-                                  int64_t opacity, double slope, double step, double stop,
-                                  double huber, const std::vector<double>& weights, bool detach_sample,
+                                  const Tensor& weight, const std::optional<Tensor>& range_offsets,
+                                  const std::optional<Tensor>& ranges, int64_t opacity, double slope, double step,
+                                  double stop, double huber, const std::vector<double>& weights, bool detach_sample,
                                   const Tensor& gradients) {
   const FieldArgument<Real> field(voxels, table, frame);
   RaysArgument<Real> rays(origins, directions, shift, background);
@@ -34,8 +33,8 @@ StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, con
   const int64_t groups = gradients.dim() > 0 ? gradients.size(0) : 0, size = field.voxels.tensor().numel();
   STD_TORCH_CHECK(groups >= 1, "gradients: expected [groups, *voxels.shape] with at least one group, got ",
                   shape_of(gradients));
-  Real* const total = output<Real>(
-      "gradients", gradients, {groups, field.view.tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
+  Real* const total = output<Real>("gradients", gradients,
+                                   {groups, field.view.tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
   const Tensor color = torch::stable::new_empty(voxels, {count, 3});
   const Tensor transmittance = torch::stable::new_empty(voxels, {count});
   const Tensor losses = torch::stable::new_zeros(voxels, {3}, ScalarType::Double);
@@ -57,7 +56,8 @@ StepResult photometric_step(Tensor voxels, Tensor table, std::vector<double> fra
                             double slope, double step, double stop, double huber, std::vector<double> weights,
                             bool detach_sample, Tensor gradients) {
   return SURFCAP_BY_TYPE(voxels, photometric_step_typed, voxels, table, frame, origins, directions, shift, background,
-                         target, mask, weight, range_offsets, ranges, opacity, slope, step, stop, huber, weights, detach_sample, gradients);
+                         target, mask, weight, range_offsets, ranges, opacity, slope, step, stop, huber, weights,
+                         detach_sample, gradients);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("photometric_step", TORCH_BOX(&photometric_step)); }

@@ -13,8 +13,7 @@ Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::v
   STD_TORCH_CHECK(weights.size() == 4, "weights: expected [tv_opacity, tv_color, parsimony, ballooning], got ",
                   weights.size(), " numbers");
   const VoxelTerms<Real> terms{Real(weights[0]), Real(weights[1]), Real(weights[2]), Real(weights[3]), Real(huber)};
-  Real* const to =
-      output<Real>("gradient", gradient, {tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
+  Real* const to = output<Real>("gradient", gradient, {tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
   for (int64_t i = 0; i < 3 * tiles; ++i)
     STD_TORCH_CHECK(places.data()[i] > 0 && places.data()[i] < field.view.n[i % 3] - 1,
                     "coordinates: expected every tile inside the table's border");

@@ -129,15 +129,17 @@ def _first_guess(capture: Capture) -> tuple[Tensor, float]:
     it as the cameras see them (the median over the cameras)."""
     cameras = capture.cameras
     assert capture.masks is not None
-    for name, mask in zip(capture.names, capture.masks, strict=True):
-        if not (mask > 0.5).any():
+    subjects = [mask.numpy() > 0.5 for mask in capture.masks]  # numpy: no threads to wake for so little
+    for name, subject in zip(capture.names, subjects, strict=True):
+        if not subject.any():
             raise InputError(f"mask of camera {name}: empty, expected a silhouette")
     center = meeting_point(capture)
     reach = []
-    for i, mask in enumerate(capture.masks):
-        subject = mask > 0.5
-        v, u = (subject.any(axis).nonzero()[:, 0].double() for axis in (1, 0))
-        corners = torch.cartesian_prod(torch.stack([u[0], u[-1] + 1]), torch.stack([v[0], v[-1] + 1]))
+    for i, subject in enumerate(subjects):
+        v, u = (np.flatnonzero(subject.any(axis)) for axis in (1, 0))
+        corners = torch.tensor(
+            [[x, y] for x in (u[0], u[-1] + 1) for y in (v[0], v[-1] + 1)], dtype=torch.float64
+        )
         toward = center - cameras.centers[i]
         _, directions = cameras.rays(i, corners)
         cosine = (directions @ toward / toward.norm()).amin().clamp(0.1, 1.0)

@@ -22,11 +22,16 @@ class TileAdam:
         self.t = 0
         count = ops.coefficients(ops.degree_of(store.shape[-1]))
         self.rate, self.low, self.high = (store.new_zeros(store.shape[-1]) for _ in range(3))
-        bounds = ((slice(0, 1), descent.rate_opacity, BOUNDS[opacity]), (slice(1, 4), descent.rate_color, (0.0, 1.0)))
+        bounds = (
+            (slice(0, 1), descent.rate_opacity, BOUNDS[opacity]),
+            (slice(1, 4), descent.rate_color, (0.0, 1.0)),
+        )
         for part, rate, (low, high) in (*bounds, (slice(4, count), descent.rate_view, (-1.0, 1.0))):
             self.rate[part], self.low[part], self.high[part] = rate, low, high
 
     def step(self, gradient: Tensor, scale: float = 1.0) -> None:
         """One step with the settings' rates times ``scale``."""
         self.t += 1
-        ops.adam_step(self.store, gradient, self.first, self.second, self.rate * scale, self.low, self.high, self.t)
+        ops.adam_step(
+            self.store, gradient, self.first, self.second, self.rate * scale, self.low, self.high, self.t
+        )

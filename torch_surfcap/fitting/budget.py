@@ -16,7 +16,10 @@ from torch_surfcap.fitting.levels import Level
 
 BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
 TILES_PER_AREA = 2.5  # stored tiles per tile face of surface, measured
-SAMPLES_PER_RAY = 7  # within the integration ranges, measured
+SAMPLES_PER_RAY = 8  # within the integration ranges, measured
+OVERHEAD = (
+    2.0  # levels run longer than the plan says, and there are ranges, voxel terms and the mesh, measured
+)
 SAMPLE_SECONDS = {4: 60e-9, 16: 90e-9, 32: 130e-9}  # forward and backward on one core, by pitch, measured
 RAY_MARGIN = 1.3  # rays per pixel of the silhouettes
 
@@ -42,7 +45,7 @@ def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor)
         rays = RAY_MARGIN * pixels / 4**level.halvings
         level_bytes.append(int(4 * numbers * (3 + gradient_groups(numbers)) + BYTES_PER_RAY * rays))
         samples += rays * level.iterations * SAMPLES_PER_RAY
-    return Budget(level_bytes, samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
+    return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
 
 
 def shortage(needed: int) -> str | None:

@@ -128,8 +128,14 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
     identity = torch.ones(len(capture), 3)
     chosen = {
         "sh_degree": {"value": degree, "reason": "default" if s.sh_degree is None else "given"},
-        "voxel": {"value": plan[-1].voxel_size, "reason": "a pixel's footprint" if s.voxel is None else "given"},
+        "voxel": {
+            "value": plan[-1].voxel_size,
+            "reason": "a pixel's footprint" if s.voxel is None else "given",
+        },
         "levels": {"value": len(plan), "reason": "size of the pictures" if s.levels is None else "given"},
-        "box": {"value": [*box[0].tolist(), *box[1].tolist()], "reason": "silhouettes" if s.box is None else "given"},
+        "box": {
+            "value": [*box[0].tolist(), *box[1].tolist()],
+            "reason": "silhouettes" if s.box is None else "given",
+        },
     }
     return FitResult(surface, mesh, history, identity, torch.zeros_like(identity), chosen, seconds, warnings)

@@ -20,7 +20,9 @@ ITERATIONS = (60, 40, 30, 20)  # from the fourth-finest level to the finest: a s
 SMALLEST_IMAGE = 32  # pixels along the shorter side of the coarsest pictures
 MARGIN = 2  # coarse voxels around the subject's box
 FOG = 0.98  # transparency that the hull is filled with
-BAND = 0.5  # voxels on either side of a signed distance's zero that the next level follows, with a margin of one
+BAND = (
+    0.5  # voxels on either side of a signed distance's zero that the next level follows, with a margin of one
+)
 SEEN = 0.02  # largest weight above which a voxel belongs to the surface; largest transmittance under which it is solid
 
 
@@ -33,7 +35,9 @@ class Level:
     iterations: int
 
 
-def plan_levels(capture: Capture, box: tuple[Tensor, Tensor], voxel: float | None, levels: int | None) -> list[Level]:
+def plan_levels(
+    capture: Capture, box: tuple[Tensor, Tensor], voxel: float | None, levels: int | None
+) -> list[Level]:
     """From coarse to fine: voxels halve and pictures double until they have their full size.
 
     The finest voxel is by default a pixel's footprint at the box's middle (the median over the cameras).
@@ -81,12 +85,11 @@ def first_field(
         raise InputError("silhouettes: the visual hull is empty inside the box, expected a subject there")
     distance = torch.from_numpy(distance_transform_edt(~hull) - distance_transform_edt(hull)).float()
     distance = distance - torch.sign(distance) * 0.5  # of voxel centres to the border between voxels
-    outside, inside = MISSING[opacity]
     if opacity == "distance":
         value = (distance - 0.5).clamp(-CLAMP, CLAMP)
         stored, deep = _tilewise(distance < 2.0), ~_tilewise(distance > -CLAMP)
     else:
-        value = torch.where(distance < 0, FOG, outside)
+        value = torch.where(distance < 0, FOG, MISSING[opacity][0])
         stored, deep = _tilewise(distance < 1.0), torch.zeros(size, dtype=torch.bool)
     grid = TileGrid.build(stored & ~deep, deep, (x, y, z), voxel_size)
     tiles = value.reshape(size[0], 4, size[1], 4, size[2], 4).permute(0, 2, 4, 1, 3, 5)

@@ -85,7 +85,9 @@ def gather_rays(
     joined = [torch.cat(column).contiguous() for column in zip(*parts, strict=True)]
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
     origins, directions, target, background, soft, weight = joined
-    return RayBatch(origins, directions, target, background, soft, weight, (offsets, torch.cat(ranges)), starts)
+    return RayBatch(
+        origins, directions, target, background, soft, weight, (offsets, torch.cat(ranges)), starts
+    )
 
 
 def find_ranges(
@@ -93,7 +95,9 @@ def find_ranges(
 ) -> tuple[Tensor, Tensor]:
     """The integration ranges of rays in the field as it now is: see ``ops.integration_ranges``."""
     frame, shift = grid.frame(*MISSING[opacity]), origins.new_zeros(len(origins))
-    return ops.integration_ranges(store, grid.table, frame, origins, directions, shift, *march, QUIET[opacity])
+    return ops.integration_ranges(
+        store, grid.table, frame, origins, directions, shift, *march, QUIET[opacity]
+    )
 
 
 def _blocked(index: Tensor) -> Tensor:

@@ -85,5 +85,7 @@ class FitSettings:
         known = {f.name for f in fields(FitSettings)}
         unknown = set(given) - known
         if unknown:
-            raise TypeError(f"fit: unknown setting {sorted(unknown)[0]!r}, expected one of {', '.join(sorted(known))}")
+            raise TypeError(
+                f"fit: unknown setting {sorted(unknown)[0]!r}, expected one of {', '.join(sorted(known))}"
+            )
         return FitSettings(**given)
