@@ -1,0 +1,163 @@
+"""fit(): a ball from its photographs, better than a voxel; the same every time; what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from tests.fitting.sphere import CENTER, RADIUS, ball
+from torch_surfcap import FitResult, InputError, fit
+from torch_surfcap.fitting import fit as fit_function
+from torch_surfcap.fitting.budget import estimate, shortage
+from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
+
+QUICK = {"levels": 2, "voxel": 1 / 40}
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def errors(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Distance of the vertices to the ball's surface."""
+    return np.linalg.norm(mesh.vertices - np.array(CENTER), axis=1) - RADIUS
+
+
+@pytest.mark.parametrize("opacity", ["transparency", "distance"])
+def test_ball(opacity: str) -> None:
+    """One closed piece, half a voxel from the truth on average or less, nowhere two; the colours explain the pictures."""
+    result = fit(ball(side=48), opacity=opacity, sh_degree=0, **QUICK)
+    voxel = result.chosen["voxel"]["value"]
+    assert voxel == 1 / 40
+    assert result.mesh.body_count == 1
+    assert result.mesh.is_watertight
+    assert result.mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
+    assert np.sqrt(np.mean(errors(result.mesh) ** 2)) < 0.5 * voxel
+    assert np.abs(errors(result.mesh)).max() < 2 * voxel
+    capture = ball(side=48)
+    backdrop = torch.zeros(48 * 48, 3)
+    with torch.no_grad():
+        seen = result.field(*capture.cameras.rays(0), backdrop)
+    assert capture.masks is not None
+    mask = capture.masks[0].flatten()
+    photograph = (capture.photograph(0).view(-1, 3) * mask[:, None]).clamp(0, 1)
+    assert (seen.color - photograph).square().mean() < 10**-2.4  # 24 dB
+    assert ((1 - seen.transmittance) - mask).abs().mean() < 0.02
+    depth = (seen.depth[mask > 0.999] - 1.5).abs()  # the centre is 1.5 away
+    assert depth.max() < RADIUS + 2 * voxel
+    levels = [row["level"] for row in result.history]
+    assert levels == sorted(levels)
+    assert set(levels) == {0.0, 1.0}
+    assert (result.gain == 1).all()
+    assert not result.bias.any()
+    assert result.gain.shape == (12, 3)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("opacity", ["transparency", "distance"])
+def test_higher_degrees(opacity: str, degree: int) -> None:
+    result = fit(ball(side=48), opacity=opacity, sh_degree=degree, levels=1, voxel=1 / 24)
+    assert result.field.sh_degree == degree
+    assert np.median(np.abs(errors(result.mesh))) < 1 / 24
+    assert result.history[-1]["loss"] < 0.2 * result.history[0]["loss"]
+    assert (result.field.sh[..., 1:, :] != 0).any()
+
+
+def test_plates_are_the_background() -> None:
+    result = fit(ball(8, 32, plates=True), sh_degree=0, levels=1, voxel=0.05)
+    assert np.abs(errors(result.mesh)).max() < 2 * 0.05
+
+
+def same(one: FitResult, two: FitResult) -> bool:
+    return torch.equal(one.field.voxels, two.field.voxels) and torch.equal(one.field.table, two.field.table)
+
+
+@pytest.mark.parametrize("opacity", ["transparency", "distance"])
+def test_same_seed_same_bits_on_any_threads(opacity: str, threads: None) -> None:
+    settings: dict[str, Any] = {"opacity": opacity, "sh_degree": 1, "levels": 2, "voxel": 0.05}
+    results = []
+    for count, seed in ((1, 0), (2, 0), (2, 1)):
+        torch.set_num_threads(count)
+        results.append(fit(ball(8, 32), seed=seed, **settings))
+    assert same(results[0], results[1])
+    assert np.array_equal(results[0].mesh.faces, results[1].mesh.faces)
+    assert np.abs(results[0].mesh.vertices - results[1].mesh.vertices).max() < 1e-12
+    assert [r["loss"] for r in results[0].history] == [r["loss"] for r in results[1].history]
+    assert not same(results[1], results[2])
+
+
+def test_progress() -> None:
+    """Called before the first level with the budget, and once for every row of the history."""
+    seen: list[Any] = []
+    result = fit(ball(6, 32), seen.append, sh_degree=0, levels=2, voxel=0.05)
+    assert seen[0].row == {}
+    assert len(seen[0].budget.level_bytes) == 2
+    assert seen[0].budget.seconds > 0
+    assert [s.row["loss"] for s in seen[1:]] == [row["loss"] for row in result.history]
+    assert {s.levels for s in seen} == {2}
+    assert seen[-1].voxels == result.field.transparency.numel()
+
+
+def test_budget_grows_with_levels_and_degree() -> None:
+    capture = ball(6, 32)
+    box = subject_box(capture, None)
+    plan = plan_levels(capture, box, 0.05, 3)
+    bytes_by_degree = []
+    for degree in (0, 1, 2):
+        grid, store = first_field(capture, box, plan[0].voxel_size, "distance", degree)
+        budget = estimate(capture, plan, grid, store)
+        assert budget.level_bytes == sorted(budget.level_bytes)
+        assert budget.level_bytes[0] > 4 * 3 * store.numel()
+        bytes_by_degree.append(budget.level_bytes[-1])
+    assert bytes_by_degree == sorted(bytes_by_degree)
+
+
+def test_shortage_is_one_line() -> None:
+    assert shortage(1) is None
+    sentence = shortage(1 << 60)
+    assert sentence is not None
+    assert "\n" not in sentence
+    assert "needs 1073741824.0 GiB" in sentence
+
+
+def test_a_level_without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first level is refused in one line; a later one is left out with a warning."""
+    asked: list[int] = []
+
+    def short_from(number: int) -> None:
+        asked.clear()
+
+        def answer(needed: int) -> str | None:
+            asked.append(needed)
+            return "needs too much" if len(asked) > number else None
+
+        monkeypatch.setattr(fit_function, "shortage", answer)
+
+    short_from(0)
+    with pytest.raises(InputError, match=r"memory: level 1 of 2 .* needs too much"):
+        fit(ball(6, 32), sh_degree=0, levels=2, voxel=0.05)
+    short_from(1)
+    result = fit(ball(6, 32), sh_degree=0, levels=2, voxel=0.05)
+    assert any("level 2 of 2" in warning and "needs too much" in warning for warning in result.warnings)
+    assert result.field.voxel_size == 0.1
+    assert np.abs(errors(result.mesh)).max() < 2 * 0.1
+
+
+def test_settings_that_are_none() -> None:
+    capture = ball(3, 8)
+    with pytest.raises(TypeError, match="fit: unknown setting 'sh_degre'"):
+        fit(capture, sh_degre=1)
+    with pytest.raises(ValueError, match="opacity: expected distance or transparency"):
+        fit(capture, opacity="alpha")
+    with pytest.raises(InputError, match="device: found cuda"):
+        fit(capture, device="cuda")
+    with pytest.raises(InputError, match="box: found"):
+        fit(capture, box=(0.0, 1.0))
