@@ -40,7 +40,7 @@ def test_every_ray_that_meets_the_surface_is_there(opacity: str) -> None:
     rays = gather_rays(capture, store, grid, opacity, march, torch.zeros(3))
     assert len(rays.camera_starts) == len(capture) + 1
     assert rays.camera_starts[-1] == len(rays)
-    assert len(rays) < 0.6 * 12 * 64 * 64
+    assert len(rays) < 0.8 * 12 * 64 * 64
     for i in range(len(capture)):
         part = slice(rays.camera_starts[i], rays.camera_starts[i + 1])
         torch.testing.assert_close(
@@ -117,9 +117,8 @@ def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
             losses.append(found[0])
             gradients.append(found[1].clone())
         torch.testing.assert_close(losses[1], losses[0], rtol=1e-3 if opacity == "distance" else 3e-3, atol=0)
-        if (
-            opacity == "distance"
-        ):  # empty space far from the surface gets no gradient from a transparency's ranges
+        # Empty space far from the surface gets no gradient within a transparency's ranges.
+        if opacity == "distance":
             assert (gradients[1] - gradients[0]).norm() < 0.02 * gradients[0].norm()
     covered = float((rays.ranges[1][:, 1] - rays.ranges[1][:, 0]).sum()) / len(rays)
     assert covered < 16 * march.step  # and they save something: the ball is 20 voxels thick, the grid 26
@@ -162,10 +161,9 @@ def test_backdrop_is_far_from_the_subject() -> None:
 def test_no_rays_where_nothing_is() -> None:
     capture = ball(3, 16)
     grid, store, march = fitted("distance", capture)
-    store[..., 0] = 4.0
-    table = torch.where(grid.table == ops.INSIDE, ops.OUTSIDE, grid.table)
-    empty = TileGrid(table, grid.coords, grid.origin, grid.voxel_size)
-    rays = gather_rays(capture, store, empty, "distance", march, torch.zeros(3))
+    none = torch.zeros(grid.size, dtype=torch.bool)
+    empty = TileGrid.build(none, none, grid.origin, grid.voxel_size)
+    rays = gather_rays(capture, store[:0], empty, "distance", march, torch.zeros(3))
     assert len(rays) == 0
     assert rays.camera_starts == [0, 0, 0, 0]
     assert rays.ranges[0].tolist() == [0]

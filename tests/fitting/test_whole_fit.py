@@ -16,7 +16,7 @@ from torch_surfcap.fitting import fit as fit_function
 from torch_surfcap.fitting.budget import estimate, shortage
 from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
 
-QUICK = {"levels": 2, "voxel": 1 / 40}
+QUICK: dict[str, Any] = {"levels": 2, "voxel": 1 / 40}
 
 
 @pytest.fixture
