@@ -122,7 +122,7 @@ def fused_step(scene: Scene) -> Result:
         ops.GROUPS,
         None,
     ]
-    losses, gradient, _, _ = ops.photometric_step(*arguments, scene.gradients)
+    losses, gradient, _, _ = ops.photometric_step(*arguments)
     return losses, gradient
 
 
