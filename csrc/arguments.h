@@ -7,6 +7,7 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include <algorithm>
 #include <initializer_list>
 #include <optional>
 #include <string>
@@ -118,7 +119,12 @@ template <class Real> struct FieldArgument {
   FieldArgument(const Tensor& v, const Tensor& t, const std::vector<double>& frame)
       : voxels("voxels", v, {kAny, kTileSide, kTileSide, kTileSide, kAny}),
         table("table", t, {kAny, kAny, kAny}),
-        view(field_view(voxels, table, frame)) {}
+        view(field_view(voxels, table, frame)) {
+    // An index beyond the tiles would read foreign memory; one pass over the table costs little beside any op.
+    const auto [least, most] = std::minmax_element(table.data(), table.data() + t.numel());
+    STD_TORCH_CHECK(*most < view.tiles && *least > -(1 << 20), "table: expected entries from ", -(1 << 20),
+                    " to the number of tiles, ", view.tiles, ", got ", *least, " to ", *most);
+  }
 };
 
 template <class Real> struct RaysArgument {
@@ -145,6 +151,8 @@ template <class Real> struct RangesArgument {
     ranges.emplace("ranges", *r, Shape{kAny, 2});
     STD_TORCH_CHECK(offsets->data()[rays.count] == r->size(0), "range_offsets: expected to end with ", r->size(0),
                     ", the number of ranges, got ", offsets->data()[rays.count]);
+    STD_TORCH_CHECK(offsets->data()[0] == 0 && std::is_sorted(offsets->data(), offsets->data() + rays.count + 1),
+                    "range_offsets: expected numbers that begin with 0 and do not fall");
     rays.range_offsets = offsets->data();
     rays.ranges = ranges->data();
   }

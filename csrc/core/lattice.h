@@ -72,6 +72,8 @@ template <class Real> class Cells {
   Pack<int32_t, 4> last_cell_, forward_;  // forward: 1 where the ray runs up the axis
 };
 
+constexpr int32_t kUnknown = -1;  // instead of a number of ranges
+
 // Hands out, front to back, the indices k of the samples in non-empty cells: by looking at the cells, or from the ray's
 // integration ranges where they are known.
 template <class Real> class Lattice {
@@ -100,7 +102,7 @@ template <class Real> class Lattice {
   SURFCAP_HD int next(int32_t* k_out, int capacity) {
     int count = 0;
     while (count < capacity && k_ < end_) {
-      if (k_ >= known_until_ && (ranges_ ? !next_range() : skip())) continue;
+      if (k_ >= known_until_ && (left_ == kUnknown ? skip() : !next_range())) continue;
       const int until = smaller(known_until_, k_ + capacity - count);
       while (k_ < until) k_out[count++] = k_++;
     }
@@ -125,10 +127,11 @@ template <class Real> class Lattice {
   }
 
   SURFCAP_HD bool next_range() {
-    if (left_-- == 0) {
+    if (left_ == 0) {
       k_ = end_;
       return false;
     }
+    --left_;
     k_ = larger(k_, index_after(ranges_[0]));
     known_until_ = smaller(index_after(ranges_[1]), end_);
     ranges_ += 2;

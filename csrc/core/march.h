@@ -32,6 +32,7 @@ template <class Real> struct RayResult {
 template <class Real, class Opacity> struct Trace {
   Sample<Real, Opacity>* samples;
   Footprints<Real>* footprints;  // capacity / kLanes
+  int64_t capacity;
 };
 
 // The most samples a ray can have in this field, rounded up to whole groups of lanes, and one group to spare.
@@ -103,7 +104,8 @@ template <class Real, int Degree, class Opacity> struct Walk {
 
  private:
   SURFCAP_HD void set_up(const Field<Real>& field) {
-    count = lattice.next(k, kLanes);
+    // A ray of unit direction never fills its room; another one ends there.
+    count = ray.samples + kLanes <= trace.capacity ? lattice.next(k, kLanes) : 0;
     if (count == 0) return;
     for (int l = count; l < kLanes; ++l) k[l] = k[count - 1];
     Pack<Real, kLanes> u[3];

@@ -37,7 +37,7 @@ template <class Real> struct SignedDistance {
   struct State {
     Real e;
   };
-  SURFCAP_HD State prepare(Real value) const { return {std::exp(-slope * value)}; }
+  SURFCAP_HD State prepare(Real value) const { return {std::exp(smaller(-slope * value, Real(60)))}; }
   SURFCAP_HD State outside() const { return {Real(0)}; }
   SURFCAP_HD Real transparency(const State& before, const State& now) const {
     return smaller(Real(1), (Real(1) + before.e) / (Real(1) + now.e));

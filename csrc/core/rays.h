@@ -44,11 +44,12 @@ template <class Real, int Degree, class Opacity> struct Marcher {
   // Begins ray i in the `slot`-th room of the trace.
   SURFCAP_HD void start(Walk& walk, const Rays<Real>& rays, int64_t i, int slot = 0) const {
     const Cells<Real> cells(field, Line<Real>(field, rays.origins + 3 * i, rays.directions + 3 * i));
-    const int64_t first = rays.ranges ? rays.range_offsets[i] : 0;
-    const Lattice<Real> lattice(cells, settings.step, rays.shift[i], rays.ranges ? rays.ranges + 2 * first : nullptr,
-                                rays.ranges ? int32_t(rays.range_offsets[i + 1] - first) : 0);
+    const bool known = rays.range_offsets != nullptr;
+    const int64_t first = known ? rays.range_offsets[i] : 0;
+    const Lattice<Real> lattice(cells, settings.step, rays.shift[i], rays.ranges + (known ? 2 * first : 0),
+                                known ? int32_t(rays.range_offsets[i + 1] - first) : kUnknown);
     walk.start(field, lattice, rays.directions + 3 * i,
-               {trace.samples + slot * capacity, trace.footprints + slot * capacity / kLanes});
+               {trace.samples + slot * capacity, trace.footprints + slot * capacity / kLanes, capacity});
   }
 
   SURFCAP_HD void finish(Walk& walk, const Real* gradient = nullptr) const {
@@ -169,7 +170,7 @@ SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Ray
   for (int k = 0; k < ray.samples; ++k) {
     const Sample<Real, Opacity>& sample = walk.trace.samples[k];
     if (!(sample.color[0] < quiet)) continue;
-    if (sample.t - step > end) {
+    if (count == 0 || sample.t - step > end) {
       out[2 * count] = sample.t - step;
       ++count;
     }

@@ -68,7 +68,7 @@ class Silhouettes:
         seen = torch.zeros(count + 1, dtype=votes.dtype)
         seen.scatter_reduce_(0, torch.from_numpy(pieces).long().flatten(), votes.flatten(), "amax")
         seen[0] = 0  # what is not occupied
-        return occupied & (2 * seen >= seen.max())[torch.from_numpy(pieces).long()]
+        return occupied & (2 * seen >= votes.max())[torch.from_numpy(pieces).long()]
 
     def _ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Least mask and number of the cameras that see world points [..., 3], both [...]."""

@@ -33,7 +33,7 @@ class Plateau:
 
     >>> rule = Plateau(limit=100)
     >>> sum(rule.goes_on(1.0) for _ in range(100))
-    15
+    11
     """
 
     limit: int

@@ -132,7 +132,7 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
             "value": plan[-1].voxel_size,
             "reason": "a pixel's footprint" if s.voxel is None else "given",
         },
-        "levels": {"value": len(plan), "reason": "size of the pictures" if s.levels is None else "given"},
+        "levels": {"value": len(by_level), "reason": "size of the pictures" if s.levels is None else "given"},
         "box": {
             "value": [*box[0].tolist(), *box[1].tolist()],
             "reason": "silhouettes" if s.box is None else "given",

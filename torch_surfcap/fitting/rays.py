@@ -1,4 +1,4 @@
-"""The rays of one level: every pixel whose ray passes a non-empty cell, with what its photograph says."""
+"""The rays of one level: every pixel whose ray meets the field, with what its photograph says."""
 
 from __future__ import annotations
 
@@ -122,8 +122,8 @@ def choose_backdrop(capture: Capture) -> Tensor | None:
         return torch.zeros(3)
     colors = []
     for i, mask in enumerate(capture.masks):
-        subject = capture.photograph(i)[mask > 0.9]
-        colors.append(subject[:: max(1, len(subject) // 2000)])
+        subject = capture.photograph(i)[mask > 0.5]
+        colors.append(subject[:: max(1, len(subject) // 1000)])
     corners = torch.tensor([[i // 4, i // 2 % 2, i % 2] for i in range(8)], dtype=torch.float32)
-    distance = torch.cdist(corners, torch.cat(colors))
-    return corners[distance.quantile(0.1, dim=1).argmax()]
+    distance = torch.cdist(corners, torch.cat(colors)).sort(dim=1).values
+    return corners[distance[:, distance.shape[1] // 10].argmax()]

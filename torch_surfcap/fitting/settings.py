@@ -88,4 +88,14 @@ class FitSettings:
             raise TypeError(
                 f"fit: unknown setting {sorted(unknown)[0]!r}, expected one of {', '.join(sorted(known))}"
             )
-        return FitSettings(**given)
+        settings = FitSettings(**given)
+        for name, sound in (
+            ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
+            ("voxel", settings.voxel is None or settings.voxel > 0),
+            ("levels", settings.levels is None or settings.levels >= 1),
+        ):
+            if not sound:
+                raise ValueError(
+                    f"fit: {name} is {getattr(settings, name)}, see FitSettings for what it may be"
+                )
+        return settings
