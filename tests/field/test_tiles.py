@@ -86,3 +86,26 @@ def test_refined_takes_the_solid_for_inside() -> None:
     assert len(fine.coords) == 0
     assert fine.inside[2, 2:4, 4:6].all()
     assert fine.inside.sum() == 4
+
+
+def test_borders_equal_the_slow_way() -> None:
+    """A voxel lies on the border if a 6-neighbour is on the other side, whichever tile that one lies in or misses."""
+    g = torch.Generator().manual_seed(0)
+    stored = torch.rand(3, 4, 2, generator=g) > 0.4
+    inside = ~stored & (torch.rand(3, 4, 2, generator=g) > 0.5)
+    grid = TileGrid.build(stored, inside, (0.0, 0.0, 0.0), 1.0)
+    within = torch.rand(len(grid.coords), 4, 4, 4, generator=g) > 0.2
+    dense = torch.zeros(14, 18, 10, dtype=torch.bool)  # with a border of one voxel, which is outside
+    inner = dense[1:-1, 1:-1, 1:-1].view(3, 4, 4, 4, 2, 4).permute(0, 2, 4, 1, 3, 5)
+    inner[inside] = True
+    i, j, k = grid.coords.long().unbind(1)
+    inner[i, j, k] = within
+    crossed = torch.zeros_like(dense)
+    for axis in range(3):
+        differs = dense.diff(dim=axis)
+        crossed.narrow(axis, 0, differs.shape[axis]).logical_or_(differs)
+        crossed.narrow(axis, 1, differs.shape[axis]).logical_or_(differs)
+    expected = crossed[1:-1, 1:-1, 1:-1].view(3, 4, 4, 4, 2, 4).permute(0, 2, 4, 1, 3, 5)[i, j, k]
+    assert expected.any()
+    assert not expected.all()
+    assert torch.equal(grid.borders(within), expected)

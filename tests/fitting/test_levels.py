@@ -124,7 +124,20 @@ def test_next_level_of_a_distance() -> None:
     assert (fine.table[tuple((tiles + 1).T)] >= 0).all()
 
 
-@pytest.mark.xfail(reason="first_field asks Silhouettes.hull, not Silhouettes.occupied")
+def test_next_level_of_a_steep_distance() -> None:
+    """No hole where the distance leaps from one side to the other between two voxels, stored or missing."""
+    grid, store, normal, offset = plane()
+    store[..., 0] = torch.where(store[..., 0] < 0, -CLAMP, CLAMP)
+    fine, _ = next_level(grid, store, "distance", no_rays(), 1.0, 0.0)
+    at = torch.tensor([[i, j, k] for i in range(32) for j in range(32) for k in range(32)])
+    away = (at + 0.5).double() * 0.2 @ normal - offset
+    surface = ((at > 0) & (at < 31)).all(1) & (
+        away.abs() < 0.2 * normal.abs().max() / 2
+    )  # its neighbours differ
+    assert surface.sum() > 500
+    assert (fine.table[tuple((at[surface] // 2 + 1).T)] >= 0).all()
+
+
 def test_first_field_has_no_phantoms() -> None:
     """In the margin and the last tiles around the box few cameras look: nothing may start there."""
     capture, voxel = ball(side=48), 1 / 24
@@ -133,9 +146,6 @@ def test_first_field_has_no_phantoms() -> None:
     assert reach.max() < 4 * voxel
 
 
-@pytest.mark.xfail(
-    reason="next_level takes voxels that no ray reads for solid, even where they are transparent"
-)
 def test_next_level_leaves_empty_space_empty() -> None:
     """Transparent voxels beside the ball that no ray happens to read are not solid."""
     grid, store = fog_around_ball()

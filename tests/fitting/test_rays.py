@@ -124,7 +124,6 @@ def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
     assert covered < 16 * march.step  # and they save something: the ball is 20 voxels thick, the grid 26
 
 
-@pytest.mark.xfail(reason="rays that pass stored but as yet empty tiles are culled for the whole level")
 @pytest.mark.parametrize("opacity", OPACITIES)
 def test_rays_beside_the_surface_are_kept(opacity: str) -> None:
     """Where the field may still grow, the rays that would object are there: what counts is the tiles, not their values."""

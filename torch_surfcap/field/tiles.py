@@ -89,6 +89,26 @@ class TileGrid:
     def to(self, device: torch.device | str) -> TileGrid:
         return TileGrid(self.table.to(device), self.coords.to(device), self.origin, self.voxel_size)
 
+    def borders(self, within: Tensor) -> Tensor:
+        """Which stored voxels have one of their 6 neighbours on the other side: bool [T, 4, 4, 4].
+
+        Args:
+            within: [T, 4, 4, 4] bool, the side of each stored voxel; missing tiles are on the side that they stand for.
+        """
+        crossed = torch.zeros_like(within)
+        for axis in range(3):
+            for side in (-1, 1):
+                places = self.places.long()
+                places[:, axis] += side
+                x, y, z = places.unbind(1)
+                entry = self.table[x, y, z].long()
+                facing = within.select(axis + 1, 0 if side > 0 else TILE - 1)[entry.clamp(min=0)]
+                facing = torch.where(entry.view(-1, 1, 1) >= 0, facing, (entry == INSIDE).view(-1, 1, 1))
+                beside = within.roll(-side, axis + 1)
+                beside.select(axis + 1, TILE - 1 if side > 0 else 0).copy_(facing)
+                crossed |= within != beside
+        return crossed
+
     def refined(self, surface: Tensor, solid: Tensor) -> TileGrid:
         """The grid of half the voxel size that follows a surface.
 

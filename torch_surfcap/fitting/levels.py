@@ -14,7 +14,7 @@ from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import CLAMP, MISSING, SLOPE
 from torch_surfcap.field.hull import Silhouettes, find_box, pixel_footprint
 from torch_surfcap.field.tiles import TileGrid
-from torch_surfcap.fitting.rays import RayBatch
+from torch_surfcap.fitting.rays import QUIET, RayBatch
 
 ITERATIONS = (60, 40, 30, 20)  # from the fourth-finest level to the finest: a scale, not a limit
 SMALLEST_IMAGE = 32  # pixels along the shorter side of the coarsest pictures
@@ -80,7 +80,7 @@ def first_field(
     x, y, z = corner.tolist()
     steps = [(torch.arange(n * ops.TILE, dtype=torch.float64) + 0.5) * voxel_size for n in size]
     points = torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + corner
-    hull = binary_dilation((Silhouettes.of(capture, grow=1).hull(points) > 0.5).numpy())
+    hull = binary_dilation(Silhouettes.of(capture, grow=1).occupied(points).numpy())
     if not hull.any():
         raise InputError("silhouettes: the visual hull is empty inside the box, expected a subject there")
     distance = torch.from_numpy(distance_transform_edt(~hull) - distance_transform_edt(hull)).float()
@@ -117,12 +117,15 @@ def next_level(
     outside, inside = MISSING[opacity]
     frame = grid.frame(outside, inside)
     if opacity == "distance":
-        surface, solid = store[..., 0].abs() < BAND, store[..., 0] < 0
+        solid = store[..., 0] < 0
+        # Where the distance is steep, it may jump over the band.
+        surface = (store[..., 0].abs() < BAND) | grid.borders(solid)
     else:
         shift = torch.zeros_like(rays.mask)
         march = (ops.OPACITY[opacity], SLOPE, step, stop)
         seen = ops.visibility(store, grid.table, frame, rays.origins, rays.directions, shift, *march)
-        surface, solid = seen[..., 1] > SEEN, seen[..., 0] < SEEN
+        surface = seen[..., 1] > SEEN
+        solid = (seen[..., 0] < SEEN) & (store[..., 0] < QUIET[opacity])
     fine = grid.refined(surface, solid)
     values = ops.upscale(store, grid.table, frame, fine.places, fine.frame(outside, inside))
     if opacity == "distance":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -69,6 +70,10 @@ def gather_rays(
         offsets, stretches = find_ranges(store, grid, opacity, march, origins, directions)
         passes = offsets.diff()
         hit = passes > 0
+        # Rays through tiles that are empty as yet stay too: they would object if the surface grew there.
+        rest = (~hit).nonzero()[:, 0]
+        all_of_them, _ = find_ranges(store, grid, opacity, march, origins[rest], directions[rest], math.inf)
+        hit[rest] = all_of_them.diff() > 0
         index, origins, directions = index[hit], origins[hit], directions[hit]
         v, u = index.unbind(1)
         photograph, soft = capture.photograph(i)[v, u], mask[v, u]
@@ -91,12 +96,25 @@ def gather_rays(
 
 
 def find_ranges(
-    store: Tensor, grid: TileGrid, opacity: str, march: March, origins: Tensor, directions: Tensor
+    store: Tensor,
+    grid: TileGrid,
+    opacity: str,
+    march: March,
+    origins: Tensor,
+    directions: Tensor,
+    quiet: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The integration ranges of rays in the field as it now is: see ``ops.integration_ranges``."""
     frame, shift = grid.frame(*MISSING[opacity]), origins.new_zeros(len(origins))
     return ops.integration_ranges(
-        store, grid.table, frame, origins, directions, shift, *march, QUIET[opacity]
+        store,
+        grid.table,
+        frame,
+        origins,
+        directions,
+        shift,
+        *march,
+        QUIET[opacity] if quiet is None else quiet,
     )
 
 
