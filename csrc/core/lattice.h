@@ -1,4 +1,4 @@
-// The samples of a ray: t_k = (k + 1/2 + shift) * step from its origin, those in empty cells left out.
+// The samples of a ray: t_k = (k + 1/2 + shift) * step from its origin, without those that nothing can be at.
 #pragma once
 
 #include "field.h"
@@ -74,8 +74,8 @@ template <class Real> class Cells {
 
 constexpr int32_t kUnknown = -1;  // instead of a number of ranges
 
-// Hands out, front to back, the indices k of the samples in non-empty cells: by looking at the cells, or from the ray's
-// integration ranges where they are known.
+// Hands out, front to back, the indices k of the samples worth taking: those in non-empty cells, found cell by cell, or
+// those within the ray's integration ranges where these are known.
 template <class Real> class Lattice {
  public:
   Lattice() = default;

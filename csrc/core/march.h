@@ -28,7 +28,7 @@ template <class Real> struct RayResult {
   int samples;
 };
 
-// Room for the samples of one ray. The caller gives the memory: `capacity` samples, a multiple of kLanes.
+// Room for the samples of a ray. The caller gives the memory: `capacity` samples, a multiple of kLanes.
 template <class Real, class Opacity> struct Trace {
   Sample<Real, Opacity>* samples;
   Footprints<Real>* footprints;  // capacity / kLanes
@@ -116,8 +116,8 @@ template <class Real, int Degree, class Opacity> struct Walk {
   }
 };
 
-// `term(sample, r, dc)` gives a sample's r_k and the derivative of r_k by its colour (lanes 1..3 of dc), and may give
-// a part of r_k that does not move the weights. Gradients are scattered into `gradient`.
+// `term(sample, dc)` returns a sample's r_k and adds to lanes 1..3 of dc the loss's derivative by its colour per unit of
+// weight w_k (what is left out of r_k does not move the weights). Gradients are scattered into `gradient`.
 template <class Real, int Degree, class Opacity, class Term>
 SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const Opacity& opacity,
                           const Coefficients<Real, Degree>& weights, Real r_inf, const Term& term, Real* gradient,

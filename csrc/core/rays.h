@@ -25,23 +25,24 @@ template <class Real> SURFCAP_HD Real dot_color(const Pack<Real, 4>& a, const Pa
   return p[1] + p[2] + p[3];
 }
 
-// Marches rays through a field. `trace` has room for `bundle` rays of `capacity` samples each.
+// Sum of weights up to which a ray has met nothing: such a sum can be all rounding.
+template <class Real> constexpr Real kNothing = Real(sizeof(Real) == 4 ? 1e-6 : 1e-12);
+
+// Marches rays through a field. `room` is that of the first of kBundle rays; the others' follow it.
 template <class Real, int Degree, class Opacity> struct Marcher {
   using Walk = surfcap::Walk<Real, Degree, Opacity>;
   const Field<Real>& field;
   const RaySettings<Real>& settings;
   const Opacity& opacity;
-  Trace<Real, Opacity> trace;
-  int64_t capacity;
+  Trace<Real, Opacity> room;
   Real missing_records[2 * Record<Degree>::kPitch];
 
-  SURFCAP_HD Marcher(const Field<Real>& f, const RaySettings<Real>& s, const Opacity& o, const Trace<Real, Opacity>& t,
-                     int64_t c)
-      : field(f), settings(s), opacity(o), trace(t), capacity(c) {
+  SURFCAP_HD Marcher(const Field<Real>& f, const RaySettings<Real>& s, const Opacity& o, const Trace<Real, Opacity>& r)
+      : field(f), settings(s), opacity(o), room(r) {
     fill_missing<Real, Degree>(field, missing_records);
   }
 
-  // Begins ray i in the `slot`-th room of the trace.
+  // Begins ray i in the `slot`-th room.
   SURFCAP_HD void start(Walk& walk, const Rays<Real>& rays, int64_t i, int slot = 0) const {
     const Cells<Real> cells(field, Line<Real>(field, rays.origins + 3 * i, rays.directions + 3 * i));
     const bool known = rays.range_offsets != nullptr;
@@ -49,11 +50,17 @@ template <class Real, int Degree, class Opacity> struct Marcher {
     const Lattice<Real> lattice(cells, settings.step, rays.shift[i], rays.ranges + (known ? 2 * first : 0),
                                 known ? int32_t(rays.range_offsets[i + 1] - first) : kUnknown);
     walk.start(field, lattice, rays.directions + 3 * i,
-               {trace.samples + slot * capacity, trace.footprints + slot * capacity / kLanes, capacity});
+               {room.samples + slot * room.capacity, room.footprints + slot * room.capacity / kLanes, room.capacity});
   }
 
   SURFCAP_HD void finish(Walk& walk, const Real* gradient = nullptr) const {
     walk.finish(field, missing_records, settings.stop, opacity, gradient);
+  }
+
+  // Both, for a ray on its own.
+  SURFCAP_HD void walk(Walk& walk, const Rays<Real>& rays, int64_t i, const Real* gradient = nullptr) const {
+    start(walk, rays, i);
+    finish(walk, gradient);
   }
 
   template <class Term>
@@ -62,17 +69,16 @@ template <class Real, int Degree, class Opacity> struct Marcher {
   }
 };
 
-// Colour [3], transmittance and depth (sum of w t / sum of w, NaN where no sample has weight) of ray i.
+// Colour [3], transmittance and depth (sum of w t / sum of w, NaN where the ray meets nothing) of ray i.
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD void render_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real* color,
                            Real* transmittance, Real* depth) {
   typename Marcher<Real, Degree, Opacity>::Walk walk;
-  march.start(walk, rays, i);
-  march.finish(walk);
+  march.walk(walk, rays, i);
   const RayResult<Real>& ray = walk.ray;
   for (int c = 0; c < 3; ++c) color[3 * i + c] = ray.sum[c + 1] + ray.transmittance * rays.background[3 * i + c];
   transmittance[i] = ray.transmittance;
-  depth[i] = ray.opacity > Real(0) ? ray.sum[0] / ray.opacity : Real(__builtin_nan(""));
+  depth[i] = ray.opacity > kNothing<Real> ? ray.sum[0] / ray.opacity : Real(__builtin_nan(""));
 }
 
 // The adjoint of render_ray by the voxels: adds to `gradient`.
@@ -81,11 +87,10 @@ SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march,
                                     const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth,
                                     Real* gradient, Real* spare) {
   typename Marcher<Real, Degree, Opacity>::Walk walk;
-  march.start(walk, rays, i);
-  march.finish(walk, gradient);
+  march.walk(walk, rays, i, gradient);
   const RayResult<Real>& ray = walk.ray;
   // depth D = S/O with S = sum w t and O = sum w: dD = (t - D)/O per unit of w. Empty rays have no depth to pull on.
-  const bool solid = ray.opacity > Real(0);
+  const bool solid = ray.opacity > kNothing<Real>;
   const Real by_depth = solid ? grad_depth[i] / ray.opacity : Real(0);
   const Real depth = solid ? ray.sum[0] / ray.opacity : Real(0);
   const Pack<Real, 4> by_color = color_of(grad_color + 3 * i);
@@ -161,12 +166,11 @@ template <class Real, int Degree, class Opacity>
 SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real quiet,
                           Real* out) {
   typename Marcher<Real, Degree, Opacity>::Walk walk;
-  march.start(walk, rays, i);
-  march.finish(walk);
+  march.walk(walk, rays, i);
   const RayResult<Real>& ray = walk.ray;
   const Real step = march.settings.step;
   int count = 0;
-  Real end = Real(-1);
+  Real end = Real(0);
   for (int k = 0; k < ray.samples; ++k) {
     const Sample<Real, Opacity>& sample = walk.trace.samples[k];
     if (!(sample.color[0] < quiet)) continue;
@@ -185,8 +189,7 @@ template <class Real, int Degree, class Opacity>
 SURFCAP_HD void visibility_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
                                Real* seen) {
   typename Marcher<Real, Degree, Opacity>::Walk walk;
-  march.start(walk, rays, i);
-  march.finish(walk);
+  march.walk(walk, rays, i);
   const RayResult<Real>& ray = walk.ray;
   for (int k = 0; k < ray.samples; ++k) {
     const Sample<Real, Opacity>& sample = walk.trace.samples[k];

@@ -25,7 +25,7 @@ template <class Real> struct Rays {
   const Real* background;  // [R, 3]
   int64_t count;
   const int64_t* range_offsets;  // [R + 1] or null: where each ray's ranges begin
-  const Real* ranges;            // [M, 2] or null: stretches of the rays that pass non-empty cells
+  const Real* ranges;            // [M, 2] or null: the stretches of the rays to sample
 };
 
 template <class Real> struct RaySettings {

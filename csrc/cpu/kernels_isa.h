@@ -48,9 +48,10 @@ void with_marcher(const Field<Real>& field, const RaySettings<Real>& settings, c
     const size_t room = capacity * kBundle, sample_bytes = room * sizeof(Sample<Real, Opacity>);
     char* memory = workspace.reserve(sample_bytes + room / kLanes * sizeof(Footprints<Real>) + 64);
     const Trace<Real, Opacity> trace{reinterpret_cast<Sample<Real, Opacity>*>(memory),
-                                     reinterpret_cast<Footprints<Real>*>(memory + (sample_bytes + 63) / 64 * 64)};
+                                     reinterpret_cast<Footprints<Real>*>(memory + (sample_bytes + 63) / 64 * 64),
+                                     capacity};
     with_degree(field.pitch, [&](auto degree) {
-      f(Marcher<Real, decltype(degree)::value, Opacity>(field, settings, opacity, trace, capacity));
+      f(Marcher<Real, decltype(degree)::value, Opacity>(field, settings, opacity, trace));
     });
   };
   if (settings.opacity == 0)
@@ -108,6 +109,13 @@ void visibility(const Field<Real>& field, const Rays<Real>& rays, const RaySetti
   });
 }
 
+// The i-th of an array of points, as for_points asks for it.
+template <class Real> auto listed(const Real* points) {
+  return [points](int64_t i, Real* x) {
+    for (int axis = 0; axis < 3; ++axis) x[axis] = points[3 * i + axis];
+  };
+}
+
 // Calls f(footprints, count, first) for every kLanes of the points begin..end, given by point(i, xyz).
 template <class Real, class Point, class F>
 void for_points(const Field<Real>& field, int64_t begin, int64_t end, const Point& point, const F& f) {
@@ -146,23 +154,17 @@ void read_points(const Field<Real>& field, int64_t begin, int64_t end, const Poi
 
 template <class Real>
 void sample_forward(const Field<Real>& field, const Real* points, int64_t begin, int64_t end, Real* values) {
-  const auto point = [&](int64_t i, Real* x) {
-    for (int axis = 0; axis < 3; ++axis) x[axis] = points[3 * i + axis];
-  };
-  read_points(field, begin, end, point, values);
+  read_points(field, begin, end, listed(points), values);
 }
 
 template <class Real>
 void sample_backward(const Field<Real>& field, const Real* points, const Real* grad_values, int64_t begin, int64_t end,
                      Real* gradient) {
   Real spare[32] = {};
-  const auto point = [&](int64_t i, Real* x) {
-    for (int axis = 0; axis < 3; ++axis) x[axis] = points[3 * i + axis];
-  };
   with_degree(field.pitch, [&](auto degree) {
     constexpr int D = decltype(degree)::value;
     using R = Record<D>;
-    for_points(field, begin, end, point, [&](const Footprints<Real>& at, int count, int64_t first) {
+    for_points(field, begin, end, listed(points), [&](const Footprints<Real>& at, int count, int64_t first) {
       for (int l = 0; l < count; ++l) {
         Coefficients<Real, D> g;
         for (int p = 0; p < R::kParts; ++p)

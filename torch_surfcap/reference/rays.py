@@ -18,6 +18,7 @@ from .voxels import huber_norm
 
 TRANSPARENCY, DISTANCE = 0, 1  # what the first coefficient of a voxel means
 BASIS_OF_PITCH = {4: 1, 16: 4, 32: 9}  # padded record length -> spherical harmonics per channel
+NOTHING = {torch.float32: 1e-6, torch.float64: 1e-12}  # sum of weights that can be all rounding: no depth
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
@@ -120,7 +121,7 @@ def march_forward(
     step: float,
     stop: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour [R,3], transmittance [R] and depth [R] of rays; depth is NaN where no sample has weight.
+    """Colour [R,3], transmittance [R] and depth [R] of rays; depth is NaN where a ray meets nothing.
 
     origins [R,3] world, directions [R,3] unit, shift [R] in steps, background [R,3]; opacity 0 =
     transparency, 1 = signed distance with slope slope; step in world units; a ray ends once its transmittance
@@ -129,7 +130,8 @@ def march_forward(
     m = march(voxels, table, frame, origins, directions, shift, opacity, slope, step, stop)
     left = m.transmittance[:, -1]
     total = m.weight.sum(1)
-    depth = torch.where(total != 0, (m.weight * m.t).sum(1) / torch.where(total != 0, total, 1), math.nan)
+    solid = total > NOTHING[voxels.dtype]
+    depth = torch.where(solid, (m.weight * m.t).sum(1) / torch.where(solid, total, 1), math.nan)
     return (m.weight[..., None] * m.color).sum(1) + left[:, None] * background, left, depth
 
 
