@@ -142,7 +142,7 @@ class PhotometricStep(torch.autograd.Function):
 
 
 class VoxelTerms(torch.autograd.Function):
-    """``apply(voxels, table, frame, coordinates, weights, huber) -> total, losses [4]``: see ``ops.voxel_terms``.
+    """``apply(voxels, table, frame, coordinates, weights, huber) -> total, losses [5]``: see ``ops.voxel_terms``.
 
     Differentiability: ``total = weights . losses`` by the voxels.
     """

@@ -234,11 +234,13 @@ def voxel_terms(
         coordinates: [T, 3] int32, where each tile stands in the table.
         weights: of the total variation of the opacity value and of the colour coefficients (sum over 6-neighbour pairs
             of the squared difference, eq. 9; missing neighbours count with their boundary value for the opacity, not
-            for colour), of the parsimony (eq. 11, Huber over ``huber``, l > 0) and of the ballooning (eq. 12).
+            for colour), of the parsimony (eq. 11, Huber over ``huber``, l > 0), of the ballooning (eq. 12) and of the
+            curvature: the squared 7-point Laplacian of the opacity value, summed over the voxels that lie, with their 6
+            neighbours, strictly between the boundary values (0 and not computed where its weight is 0).
         gradient: [T, 4, 4, 4, P], written in place.
 
     Returns:
-        losses [4] float64 in the order of ``weights``, not yet times them.
+        losses [5] float64 in the order of ``weights``, not yet times them.
     """
     return cast(Tensor, _ops.voxel_terms(voxels, table, frame, coordinates, weights, huber, gradient))
 
@@ -319,7 +321,7 @@ def _register_shapes() -> None:
 
     @fake("torch_surfcap::voxel_terms")
     def _(voxels, *rest):  # type: ignore[no-untyped-def]
-        return voxels.new_empty(4, dtype=torch.float64)
+        return voxels.new_empty(5, dtype=torch.float64)
 
     @fake("torch_surfcap::adam_step")
     def _(*arguments):  # type: ignore[no-untyped-def]

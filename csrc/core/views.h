@@ -48,8 +48,8 @@ template <class Real> struct PhotometricSettings {
 };
 
 template <class Real> struct VoxelTerms {
-  Real tv_opacity, tv_color, parsimony, ballooning;  // weights
-  Real huber;                                        // where the parsimony's norm turns linear
+  Real tv_opacity, tv_color, parsimony, ballooning, curvature;  // weights
+  Real huber;                                                   // where the parsimony's norm turns linear
 };
 
 template <class Real> struct AdamSettings {

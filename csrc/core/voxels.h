@@ -3,6 +3,7 @@
 
 #include <cmath>
 
+#include "curvature.h"
 #include "rays.h"
 
 namespace surfcap {
@@ -11,8 +12,10 @@ inline namespace SURFCAP_ISA {
 // Voxel terms of one tile, and their gradient added to the tile's own voxels:
 //   total variation  sum over unordered pairs of 6-neighbours (x_i - x_j)^2   (each voxel takes its own side of a pair)
 //   parsimony (eq. 11)  sum of Huber(b_lm), l > 0          ballooning (eq. 12)  sum of the opacity value squared
+//   curvature of the opacity value, see there; left out where its weight is 0
 // A missing neighbour counts with its boundary value for the opacity and not at all for colour: black would bleed in.
-// losses: tv opacity, tv colour, parsimony, ballooning, unweighted.
+// losses: tv opacity, tv colour, parsimony, ballooning, curvature, unweighted. The squares are those of the pairs that
+// this tile meets.
 template <class Real, int Degree>
 SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordinate, const VoxelTerms<Real>& terms,
                                  int64_t tile, double* losses, Real* gradient) {
@@ -63,7 +66,7 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
         }
       }
     }
-    Real* to = gradient ? gradient + voxel * R::kPitch : nullptr;
+    Real* const to = gradient + voxel * R::kPitch;
     for (int p = 0; p < R::kParts; ++p) {
       P g = (Real(2) * load<Real, R::kPart>(tv_row + p * R::kPart)) * sum[p];
       if constexpr (Degree > 0) {
@@ -75,7 +78,7 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
         }
       }
       if (p == 0) g[0] += Real(2) * (terms.tv_opacity * to_boundary + terms.ballooning * record[0]);
-      if (to) store<Real, R::kPart>(to + p * R::kPart, load<Real, R::kPart>(to + p * R::kPart) + g);
+      store<Real, R::kPart>(to + p * R::kPart, load<Real, R::kPart>(to + p * R::kPart) + g);
     }
     ballooning += record[0] * record[0];
   }
@@ -86,6 +89,7 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
   losses[1] += double(Real(0.5) * tv_color);
   losses[2] += double(parsimony);
   losses[3] += double(ballooning);
+  if (terms.curvature != Real(0)) losses[4] += double(curvature_tile(field, cell, tile, terms.curvature, gradient));
 }
 
 // Adam (Kingma and Ba 2015) on `count` numbers that begin at a record, then the clamp to [low, high].

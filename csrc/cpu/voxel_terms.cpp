@@ -1,7 +1,10 @@
-// voxel_terms: total variation, parsimony and ballooning of all voxels; their gradient is added to `gradient`.
+// voxel_terms: total variation, parsimony, ballooning and curvature of all voxels; their gradient is added to
+// `gradient`.
 #include "parallel.h"
 
 namespace surfcap {
+
+constexpr int kVoxelTerms = 5;
 
 template <class Real>
 Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
@@ -10,9 +13,11 @@ Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::v
   const FieldArgument<Real> field(voxels, table, frame);
   const int64_t tiles = field.view.tiles;
   const Input<int32_t> places("coordinates", coordinates, {tiles, 3});
-  STD_TORCH_CHECK(weights.size() == 4, "weights: expected [tv_opacity, tv_color, parsimony, ballooning], got ",
-                  weights.size(), " numbers");
-  const VoxelTerms<Real> terms{Real(weights[0]), Real(weights[1]), Real(weights[2]), Real(weights[3]), Real(huber)};
+  STD_TORCH_CHECK(weights.size() == kVoxelTerms,
+                  "weights: expected [tv_opacity, tv_color, parsimony, ballooning, curvature], got ", weights.size(),
+                  " numbers");
+  const VoxelTerms<Real> terms{Real(weights[0]), Real(weights[1]), Real(weights[2]),
+                               Real(weights[3]), Real(weights[4]), Real(huber)};
   Real* const to = output<Real>("gradient", gradient, {tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
   for (int64_t i = 0; i < 3 * tiles; ++i)
     STD_TORCH_CHECK(places.data()[i] > 0 && places.data()[i] < field.view.n[i % 3] - 1,
@@ -20,16 +25,16 @@ Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::v
 
   // A fixed number of blocks, each with its own sums, so that the values do not depend on the threads.
   constexpr int64_t kBlocks = 64;
-  double by_block[kBlocks][4] = {};
+  double by_block[kBlocks][kVoxelTerms] = {};
   parallel_ranges(kBlocks, 1, [&](int64_t first, int64_t last) {
     for (int64_t b = first; b < last; ++b)
       best_kernels<Real>().voxel_terms(field.view, places.data(), terms, b * tiles / kBlocks, (b + 1) * tiles / kBlocks,
                                        by_block[b], to);
   });
-  const Tensor losses = torch::stable::new_zeros(voxels, {4}, ScalarType::Double);
+  const Tensor losses = torch::stable::new_zeros(voxels, {kVoxelTerms}, ScalarType::Double);
   double* const sum = losses.template mutable_data_ptr<double>();
   for (const auto& block : by_block)
-    for (int i = 0; i < 4; ++i) sum[i] += block[i];
+    for (int i = 0; i < kVoxelTerms; ++i) sum[i] += block[i];
   return losses;
 }
 

@@ -120,6 +120,6 @@ def test_the_loss_falls_alike_on_any_threads(opacity: str, threads: None) -> Non
     assert [row["iteration"] for row in rows] == list(range(len(rows)))
     assert rows[-1]["loss"] < 0.5 * rows[0]["loss"]
     weights = FitSettings.of(opacity=opacity).losses
-    names = ("photo", "sample", "mask", "tv_opacity", "tv_color", "parsimony", "ballooning")
+    names = ("photo", "sample", "mask", "tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
     for row in rows:
         assert row["loss"] == pytest.approx(sum(getattr(weights, name) * row[name] for name in names))

@@ -67,7 +67,7 @@ def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
     if name == "visibility":
         return [*scene.field, *scene.rays[:3], *march, GROUPS]
     if name == "voxel_terms":
-        return [*scene.field, scene.coordinates, [0.3, 0.7, 0.2, 0.4], 0.1, normal(v, *v.shape)]
+        return [*scene.field, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1, normal(v, *v.shape)]
     if name == "adam_step":
         rate, high = normal(v, count).abs() * 0.1, v.new_full((count,), 0.9)
         return [

@@ -23,7 +23,7 @@ GROUPS = (4, 32)  # fewest, most
 PARSIMONY_HUBER = 0.1
 
 RAY_LOSSES = ("photo", "sample", "mask")
-VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning")
+VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
 
 
 @dataclass
@@ -78,8 +78,9 @@ def descend(
         generator: of the lattices' shifts. seconds: receives the time spent per stage.
     """
     loss = settings.losses
-    ray_weights = [loss.photo, loss.sample, loss.mask]
-    voxel_weights = [loss.tv_opacity, loss.tv_color, loss.parsimony, loss.ballooning]
+    ray_weights, voxel_weights = (
+        [getattr(loss, name) for name in names] for names in (RAY_LOSSES, VOXEL_LOSSES)
+    )
     weights = torch.tensor([*ray_weights, *voxel_weights], dtype=torch.float64)
     frame = grid.frame(*MISSING[settings.opacity])
     bundle = (rays.origins, rays.directions)

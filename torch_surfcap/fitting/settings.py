@@ -19,6 +19,7 @@ class Losses:
     tv_color: float = 1e-3  # squared steps of the colour coefficients
     parsimony: float = 1e-3  # Huber norm of the view-dependent coefficients, eq. 11
     ballooning: float = 0.0  # squared opacity value, eq. 12
+    curvature: float = 3e-5  # squared Laplacian of the opacity value
     detach_sample: bool = False  # the sample loss moves colours only
 
 
@@ -37,7 +38,7 @@ class Descent:
 
 LOSSES = {
     "distance": Losses(),
-    "transparency": Losses(sample=1.0, mask=0.1, tv_opacity=2e-4, ballooning=2e-5),
+    "transparency": Losses(sample=1.0, mask=0.1, tv_opacity=2e-4, ballooning=2e-5, curvature=0.0),
 }
 DESCENT = {
     "distance": Descent(),

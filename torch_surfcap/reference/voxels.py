@@ -24,12 +24,13 @@ def voxel_terms(
     huber: float,
     gradient: Tensor,
 ) -> Tensor:
-    """Losses [4] in double, unweighted: TV of the opacity value, TV of colour, parsimony (eq. 11), ballooning
-    (eq. 12); adds the gradient of weights · losses to `gradient` [T,4,4,4,P].
+    """Losses [5] in double, unweighted: TV of the opacity value, TV of colour, parsimony (eq. 11), ballooning
+    (eq. 12), curvature (0 where its weight is); adds the gradient of weights · losses to `gradient` [T,4,4,4,P].
 
     TV sums (x_i - x_j)² over unordered pairs of 6-neighbours of which at least one is stored. A missing
-    neighbour has its boundary value for the opacity value and does not count for colour. coordinates [T,3]
-    place the tiles in the table.
+    neighbour has its boundary value for the opacity value and does not count for colour. The curvature sums the
+    squared 7-point Laplacian of the opacity value where all 7 lie strictly between the boundary values.
+    coordinates [T,3] place the tiles in the table.
     """
     if not bool(
         (table[coordinates.long().unbind(-1)] == torch.arange(len(coordinates), device=table.device)).all()
@@ -46,7 +47,16 @@ def voxel_terms(
         tv_color = tv_color + squares[..., 1:][first & second].sum()
     parsimony = huber_norm(leaf[..., 4:], huber).sum()
     ballooning = (leaf[..., 0] ** 2).sum()
-    losses = torch.stack([tv_opacity, tv_color, parsimony, ballooning])
+    value, inner = grid[..., 0], slice(1, -1)
+    star = [value[inner, inner, inner]]
+    for axis in range(3):
+        cut = value[tuple(slice(None) if a == axis else inner for a in range(3))]
+        star += [cut.narrow(axis, side, value.shape[axis] - 2) for side in (0, 2)]
+    low, high = sorted(frame[4:6])
+    known = torch.stack([(low < v) & (v < high) for v in star]).all(0) & (weights[4] != 0)
+    laplacian = torch.stack(star[1:]).sum(0) - 6 * star[0]
+    curvature = (laplacian[known] ** 2).sum()
+    losses = torch.stack([tv_opacity, tv_color, parsimony, ballooning, curvature])
     gradient += torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)[0]
     return losses.detach().double()
 

@@ -1,0 +1,79 @@
+// The curvature of the opacity value: the squared 7-point Laplacian, summed over the voxels where it is known, namely
+// where the voxel and its 6 neighbours lie strictly between the two boundary values. Missing voxels never do, nor do
+// clamped distances. Along a signed distance's normal it vanishes, so that, unlike total variation, it neither pulls a
+// plane nor shrinks a ball to first order: what it costs is bending.
+#pragma once
+
+#include "field.h"
+
+namespace surfcap {
+inline namespace SURFCAP_ISA {
+
+// Adds the gradient of `weight` times the term to the opacity values of a tile, and returns the term's share of the
+// tile's own voxels. `cell` is the tile's place in the table.
+template <class Real>
+SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t tile, Real weight, Real* gradient) {
+  constexpr int kSide = 2 * kTile, kHalo = 2;  // the tile with two voxels around it: a neighbour's neighbours
+  using Row = Pack<Real, kSide>;
+  const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
+  const Real low = smaller(field.missing[0], field.missing[1]), high = larger(field.missing[0], field.missing[1]);
+
+  // One number more at either end: rows along z are also read one to the left and one to the right.
+  Real values[kSide * kSide * kSide + 2], laplacian[kSide * kSide * kSide + 2];
+  Real *const value = values + 1, *const bend = laplacian + 1;
+  values[0] = values[kSide * kSide * kSide + 1] = laplacian[0] = laplacian[kSide * kSide * kSide + 1] = Real(0);
+  for (int x = 0; x < kSide; ++x) {
+    for (int y = 0; y < kSide; ++y) {
+      const int64_t column = cell + ((x + kHalo) / kTile - 1) * stride[0] + ((y + kHalo) / kTile - 1) * stride[1];
+      const int local = ((x + kHalo) % kTile * kTile + (y + kHalo) % kTile) * kTile;
+      for (int z = 0; z < kSide; ++z) {
+        const int32_t entry = field.table[column + (z + kHalo) / kTile - 1];
+        const int64_t voxel = int64_t(entry) * kTileVoxels + local + (z + kHalo) % kTile;
+        value[(x * kSide + y) * kSide + z] =
+            entry < 0 ? field.missing[entry == kInside] : field.voxels[voxel * field.pitch];
+      }
+    }
+  }
+
+  const int along[3] = {kSide * kSide, kSide, 1};
+  const auto sum_of_neighbours = [&](const Real* at) {
+    Row sum = zero_pack<Real, kSide>();
+    for (int axis = 0; axis < 3; ++axis)
+      sum += load<Real, kSide>(at - along[axis]) + load<Real, kSide>(at + along[axis]);
+    return sum;
+  };
+  for (int x = 1; x < kSide - 1; ++x) {
+    for (int y = 1; y < kSide - 1; ++y) {
+      const int row = (x * kSide + y) * kSide;
+      const Row here = load<Real, kSide>(value + row);
+      Row least = here, most = here;
+      for (int axis = 0; axis < 3; ++axis) {
+        for (int side = -1; side <= 1; side += 2) {
+          const Row other = load<Real, kSide>(value + row + side * along[axis]);
+          least = smaller_pack<Real, kSide>(least, other);
+          most = larger_pack<Real, kSide>(most, other);
+        }
+      }
+      const Row difference = sum_of_neighbours(value + row) - Real(2 * 3) * here;
+      for (int z = 0; z < kSide; ++z) {
+        const bool known = z > 0 && z < kSide - 1 && least[z] > low && most[z] < high;
+        bend[row + z] = known ? difference[z] : Real(0);
+      }
+    }
+  }
+
+  Real loss = Real(0);
+  for (int v = 0; v < kTileVoxels / kTile; ++v) {  // rows of the tile
+    const int row = ((v / kTile + kHalo) * kSide + v % kTile + kHalo) * kSide;
+    const Row here = load<Real, kSide>(bend + row);
+    const Row by_value = Real(2) * weight * (sum_of_neighbours(bend + row) - Real(2 * 3) * here);
+    for (int z = 0; z < kTile; ++z) {
+      loss += here[z + kHalo] * here[z + kHalo];
+      gradient[((tile * kTileVoxels) + v * kTile + z) * field.pitch] += by_value[z + kHalo];
+    }
+  }
+  return loss;
+}
+
+}  // namespace SURFCAP_ISA
+}  // namespace surfcap
