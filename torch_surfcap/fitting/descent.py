@@ -37,7 +37,7 @@ class Plateau:
     """
 
     limit: int
-    gain: float = 0.01
+    gain: float = 0.02
     window: int = 5
     factor: float = 0.3
     drops: int = 2

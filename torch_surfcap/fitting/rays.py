@@ -16,7 +16,7 @@ from torch_surfcap.field.hull import grown
 from torch_surfcap.field.tiles import TileGrid
 
 BLOCK = 8  # rays are ordered in blocks of so many pixels a side, so that neighbours read the same tiles
-QUIET = {"transparency": 0.999, "distance": 2.0}  # opacity value above which space is as good as empty
+QUIET = {"transparency": 0.999, "distance": 1.5}  # opacity value above which space is as good as empty
 MARGIN = 4  # voxels beyond the silhouette that rays are followed
 
 
@@ -61,6 +61,7 @@ def gather_rays(
     distance = (cameras.centers - center).norm(dim=1)
     focal = torch.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
     pixels_per_voxel = grid.voxel_size * focal / distance
+    store = colorless(store)
     parts: list[tuple[Tensor, ...]] = []
     starts, counts, ranges = [0], [], []
     for i, mask in enumerate(capture.masks):
@@ -95,6 +96,11 @@ def gather_rays(
     )
 
 
+def colorless(store: Tensor) -> Tensor:
+    """The field with as little colour as a record can have: a search for its surface walks through less memory."""
+    return store[..., : ops.pitch(0)].contiguous()
+
+
 def find_ranges(
     store: Tensor,
     grid: TileGrid,
@@ -104,18 +110,11 @@ def find_ranges(
     directions: Tensor,
     quiet: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The integration ranges of rays in the field as it now is: see ``ops.integration_ranges``."""
+    """The integration ranges of rays in the field as it now is, see ``ops.integration_ranges``; ``quiet`` is by default what
+    suits the opacity."""
     frame, shift = grid.frame(*MISSING[opacity]), origins.new_zeros(len(origins))
-    return ops.integration_ranges(
-        store,
-        grid.table,
-        frame,
-        origins,
-        directions,
-        shift,
-        *march,
-        QUIET[opacity] if quiet is None else quiet,
-    )
+    level = QUIET[opacity] if quiet is None else quiet
+    return ops.integration_ranges(colorless(store), grid.table, frame, origins, directions, shift, *march, level)
 
 
 def _blocked(index: Tensor) -> Tensor:
