@@ -19,7 +19,8 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
   m.def("integration_ranges(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH
         ", float quiet) -> (Tensor, Tensor)");
   m.def("visibility(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH ", int groups) -> Tensor");
-  m.def("voxel_terms(" FIELD ", Tensor coordinates, float[] weights, float huber, Tensor(a!) gradient) -> Tensor");
+  m.def("voxel_terms(" FIELD
+        ", Tensor coordinates, float[] weights, float huber, float bend, Tensor(a!) gradient) -> Tensor");
   m.def(
       "adam_step(Tensor(a!) voxels, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor low, "
       "Tensor high, float beta1, float beta2, float epsilon, int t) -> ()");

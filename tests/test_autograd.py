@@ -35,7 +35,7 @@ def photometric(scene: Scene) -> Tensor:
 
 
 def terms(scene: Scene) -> Tensor:
-    total: Tensor = VoxelTerms.apply(*scene.field, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1)[0]
+    total: Tensor = VoxelTerms.apply(*scene.field, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1, 0.05)[0]
     return total
 
 

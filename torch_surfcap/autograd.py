@@ -142,7 +142,7 @@ class PhotometricStep(torch.autograd.Function):
 
 
 class VoxelTerms(torch.autograd.Function):
-    """``apply(voxels, table, frame, coordinates, weights, huber) -> total, losses [5]``: see ``ops.voxel_terms``.
+    """``apply(voxels, table, frame, coordinates, weights, huber, bend) -> total, losses [5]``: see ``ops.voxel_terms``.
 
     Differentiability: ``total = weights . losses`` by the voxels.
     """
@@ -156,9 +156,10 @@ class VoxelTerms(torch.autograd.Function):
         coordinates: Tensor,
         weights: list[float],
         huber: float,
+        bend: float,
     ) -> tuple[Tensor, Tensor]:
         gradient = torch.zeros_like(voxels, memory_format=torch.contiguous_format)
-        losses = ops.voxel_terms(voxels, table, frame, coordinates, weights, huber, gradient)
+        losses = ops.voxel_terms(voxels, table, frame, coordinates, weights, huber, bend, gradient)
         ctx.save_for_backward(gradient)
         ctx.mark_non_differentiable(losses)
         return (losses @ losses.new_tensor(weights)).to(voxels.dtype), losses
@@ -167,4 +168,4 @@ class VoxelTerms(torch.autograd.Function):
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, by_total: Tensor, *unused: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return (by_total * gradient if ctx.needs_input_grad[0] else None, *[None] * 5)
+        return (by_total * gradient if ctx.needs_input_grad[0] else None, *[None] * 6)

@@ -58,7 +58,7 @@ class LossesConfig:
     tv_color: float | None = _within(None, 0)  # weight of squared steps of the colour between voxels
     parsimony: float | None = _within(None, 0)  # weight of Huber's norm of the view-dependent coefficients
     ballooning: float | None = _within(None, 0)  # weight of the squared opacity value
-    curvature: float | None = _within(None, 0)  # weight of the squared Laplacian of the opacity value
+    curvature: float | None = _within(None, 0)  # weight of the bending of the opacity value
     detach_sample: bool | None = None  # the sample loss moves colours only
 
 

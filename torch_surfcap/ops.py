@@ -226,6 +226,7 @@ def voxel_terms(
     coordinates: Tensor,
     weights: list[float],
     huber: float,
+    bend: float,
     gradient: Tensor,
 ) -> Tensor:
     """Losses of the voxels themselves; the gradient of ``weights . losses`` is added to ``gradient``.
@@ -235,14 +236,14 @@ def voxel_terms(
         weights: of the total variation of the opacity value and of the colour coefficients (sum over 6-neighbour pairs
             of the squared difference, eq. 9; missing neighbours count with their boundary value for the opacity, not
             for colour), of the parsimony (eq. 11, Huber over ``huber``, l > 0), of the ballooning (eq. 12) and of the
-            curvature: the squared 7-point Laplacian of the opacity value, summed over the voxels that lie, with their 6
-            neighbours, strictly between the boundary values (0 and not computed where its weight is 0).
+            curvature (Huber over ``bend`` of the 7-point Laplacian of the opacity value at the voxels that lie, with their
+            6 neighbours, strictly between the boundary values; 0 and not computed where its weight is 0).
         gradient: [T, 4, 4, 4, P], written in place.
 
     Returns:
         losses [5] float64 in the order of ``weights``, not yet times them.
     """
-    return cast(Tensor, _ops.voxel_terms(voxels, table, frame, coordinates, weights, huber, gradient))
+    return cast(Tensor, _ops.voxel_terms(voxels, table, frame, coordinates, weights, huber, bend, gradient))
 
 
 def adam_step(

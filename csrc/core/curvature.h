@@ -1,7 +1,7 @@
-// The curvature of the opacity value: the squared 7-point Laplacian, summed over the voxels where it is known, namely
+// The curvature of the opacity value: Huber's norm of the 7-point Laplacian, over the voxels where it is known, namely
 // where the voxel and its 6 neighbours lie strictly between the two boundary values. Missing voxels never do, nor do
 // clamped distances. Along a signed distance's normal it vanishes, so that, unlike total variation, it neither pulls a
-// plane nor shrinks a ball to first order: what it costs is bending.
+// plane nor shrinks a ball to first order: what it costs is bending. Huber's norm spares edges and thin parts.
 #pragma once
 
 #include "field.h"
@@ -12,16 +12,18 @@ inline namespace SURFCAP_ISA {
 // Adds the gradient of `weight` times the term to the opacity values of a tile, and returns the term's share of the
 // tile's own voxels. `cell` is the tile's place in the table.
 template <class Real>
-SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t tile, Real weight, Real* gradient) {
+SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t tile, Real weight, Real eps,
+                               Real* gradient) {
   constexpr int kSide = 2 * kTile, kHalo = 2;  // the tile with two voxels around it: a neighbour's neighbours
   using Row = Pack<Real, kSide>;
   const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
   const Real low = smaller(field.missing[0], field.missing[1]), high = larger(field.missing[0], field.missing[1]);
 
   // One number more at either end: rows along z are also read one to the left and one to the right.
-  Real values[kSide * kSide * kSide + 2], laplacian[kSide * kSide * kSide + 2];
-  Real *const value = values + 1, *const bend = laplacian + 1;
-  values[0] = values[kSide * kSide * kSide + 1] = laplacian[0] = laplacian[kSide * kSide * kSide + 1] = Real(0);
+  // bend: the norm's derivative by the Laplacian.
+  Real values[kSide * kSide * kSide + 2], bends[kSide * kSide * kSide + 2];
+  Real *const value = values + 1, *const bend = bends + 1;
+  values[0] = values[kSide * kSide * kSide + 1] = bends[0] = bends[kSide * kSide * kSide + 1] = Real(0);
   for (int x = 0; x < kSide; ++x) {
     for (int y = 0; y < kSide; ++y) {
       const int64_t column = cell + ((x + kHalo) / kTile - 1) * stride[0] + ((y + kHalo) / kTile - 1) * stride[1];
@@ -35,6 +37,7 @@ SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t t
     }
   }
 
+  Real loss = Real(0);
   const int along[3] = {kSide * kSide, kSide, 1};
   const auto sum_of_neighbours = [&](const Real* at) {
     Row sum = zero_pack<Real, kSide>();
@@ -57,20 +60,18 @@ SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t t
       const Row difference = sum_of_neighbours(value + row) - Real(2 * 3) * here;
       for (int z = 0; z < kSide; ++z) {
         const bool known = z > 0 && z < kSide - 1 && least[z] > low && most[z] < high;
-        bend[row + z] = known ? difference[z] : Real(0);
+        const Real norm = huber(known ? difference[z] : Real(0), eps, bend[row + z]);
+        if (x >= kHalo && x < kHalo + kTile && y >= kHalo && y < kHalo + kTile && z >= kHalo && z < kHalo + kTile)
+          loss += norm;
       }
     }
   }
 
-  Real loss = Real(0);
   for (int v = 0; v < kTileVoxels / kTile; ++v) {  // rows of the tile
     const int row = ((v / kTile + kHalo) * kSide + v % kTile + kHalo) * kSide;
     const Row here = load<Real, kSide>(bend + row);
-    const Row by_value = Real(2) * weight * (sum_of_neighbours(bend + row) - Real(2 * 3) * here);
-    for (int z = 0; z < kTile; ++z) {
-      loss += here[z + kHalo] * here[z + kHalo];
-      gradient[((tile * kTileVoxels) + v * kTile + z) * field.pitch] += by_value[z + kHalo];
-    }
+    const Row by_value = weight * (sum_of_neighbours(bend + row) - Real(2 * 3) * here);
+    for (int z = 0; z < kTile; ++z) gradient[(tile * kTileVoxels + v * kTile + z) * field.pitch] += by_value[z + kHalo];
   }
   return loss;
 }

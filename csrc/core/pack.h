@@ -128,5 +128,11 @@ template <class Real> SURFCAP_HD Real smaller(Real a, Real b) { return a < b ? a
 template <class Real> SURFCAP_HD Real larger(Real a, Real b) { return a > b ? a : b; }
 template <class Real> SURFCAP_HD Real clamped(Real x, Real low, Real high) { return smaller(larger(x, low), high); }
 
+// Huber's norm, x^2/2 below eps and eps (|x| - eps/2) above, and its derivative; both without a branch.
+template <class Real> SURFCAP_HD Real huber(Real x, Real eps, Real& derivative) {
+  derivative = clamped(x, -eps, eps);
+  return derivative * (x - Real(0.5) * derivative);
+}
+
 }  // namespace SURFCAP_ISA
 }  // namespace surfcap

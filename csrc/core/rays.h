@@ -8,12 +8,6 @@ inline namespace SURFCAP_ISA {
 
 constexpr int kBundle = 8;  // rays in flight
 
-// Huber's norm, x^2/2 below eps and eps (|x| - eps/2) above, and its derivative; both without a branch.
-template <class Real> SURFCAP_HD Real huber(Real x, Real eps, Real& derivative) {
-  derivative = clamped(x, -eps, eps);
-  return derivative * (x - Real(0.5) * derivative);
-}
-
 template <class Real> SURFCAP_HD Pack<Real, 4> color_of(const Real* rgb) {
   Pack<Real, 4> p = zero_pack<Real, 4>();
   for (int i = 0; i < 3; ++i) p[i + 1] = rgb[i];

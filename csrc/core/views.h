@@ -49,7 +49,7 @@ template <class Real> struct PhotometricSettings {
 
 template <class Real> struct VoxelTerms {
   Real tv_opacity, tv_color, parsimony, ballooning, curvature;  // weights
-  Real huber;                                                   // where the parsimony's norm turns linear
+  Real huber, bend;  // where the parsimony's and the curvature's norm turn linear
 };
 
 template <class Real> struct AdamSettings {

@@ -89,7 +89,8 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
   losses[1] += double(Real(0.5) * tv_color);
   losses[2] += double(parsimony);
   losses[3] += double(ballooning);
-  if (terms.curvature != Real(0)) losses[4] += double(curvature_tile(field, cell, tile, terms.curvature, gradient));
+  if (terms.curvature != Real(0))
+    losses[4] += double(curvature_tile(field, cell, tile, terms.curvature, terms.bend, gradient));
 }
 
 // Adam (Kingma and Ba 2015) on `count` numbers that begin at a record, then the clamp to [low, high].

@@ -8,7 +8,7 @@ constexpr int kVoxelTerms = 5;
 
 template <class Real>
 Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
-                         const Tensor& coordinates, const std::vector<double>& weights, double huber,
+                         const Tensor& coordinates, const std::vector<double>& weights, double huber, double bend,
                          const Tensor& gradient) {
   const FieldArgument<Real> field(voxels, table, frame);
   const int64_t tiles = field.view.tiles;
@@ -16,8 +16,8 @@ Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::v
   STD_TORCH_CHECK(weights.size() == kVoxelTerms,
                   "weights: expected [tv_opacity, tv_color, parsimony, ballooning, curvature], got ", weights.size(),
                   " numbers");
-  const VoxelTerms<Real> terms{Real(weights[0]), Real(weights[1]), Real(weights[2]),
-                               Real(weights[3]), Real(weights[4]), Real(huber)};
+  const VoxelTerms<Real> terms{Real(weights[0]), Real(weights[1]), Real(weights[2]), Real(weights[3]),
+                               Real(weights[4]), Real(huber),      Real(bend)};
   Real* const to = output<Real>("gradient", gradient, {tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
   for (int64_t i = 0; i < 3 * tiles; ++i)
     STD_TORCH_CHECK(places.data()[i] > 0 && places.data()[i] < field.view.n[i % 3] - 1,
@@ -39,8 +39,8 @@ Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::v
 }
 
 Tensor voxel_terms(Tensor voxels, Tensor table, std::vector<double> frame, Tensor coordinates,
-                   std::vector<double> weights, double huber, Tensor gradient) {
-  return SURFCAP_BY_TYPE(voxels, voxel_terms_typed, voxels, table, frame, coordinates, weights, huber, gradient);
+                   std::vector<double> weights, double huber, double bend, Tensor gradient) {
+  return SURFCAP_BY_TYPE(voxels, voxel_terms_typed, voxels, table, frame, coordinates, weights, huber, bend, gradient);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("voxel_terms", TORCH_BOX(&voxel_terms)); }

@@ -15,7 +15,7 @@ from torch_surfcap import reference
 from torch_surfcap.reference import TRANSPARENCY
 
 ops: Any = _ops  # untyped: the tests unpack lists of arguments into its functions
-WRITES = {"voxel_terms": [6], "adam_step": [0, 2, 3]}  # arguments that an op changes in place
+WRITES = {"voxel_terms": [7], "adam_step": [0, 2, 3]}  # arguments that an op changes in place
 NAMES = (
     "sample_forward",
     "sample_backward",
@@ -67,7 +67,7 @@ def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
     if name == "visibility":
         return [*scene.field, *scene.rays[:3], *march, GROUPS]
     if name == "voxel_terms":
-        return [*scene.field, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1, normal(v, *v.shape)]
+        return [*scene.field, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1, 0.05, normal(v, *v.shape)]
     if name == "adam_step":
         rate, high = normal(v, count).abs() * 0.1, v.new_full((count,), 0.9)
         return [

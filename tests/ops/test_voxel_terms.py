@@ -28,7 +28,7 @@ def test_by_hand(device: str) -> None:
     voxels[0, 1, 2, 1, 9] = -0.2
     coordinates = torch.ones(1, 3, dtype=torch.int32, device=device)
     gradient = torch.zeros_like(voxels)
-    losses = ops.voxel_terms(voxels, table, frame, coordinates, [1.0, 1.0, 1.0, 1.0, 0.0], 0.1, gradient)
+    losses = ops.voxel_terms(voxels, table, frame, coordinates, [1.0, 1.0, 1.0, 1.0, 0.0], 0.1, 0.4, gradient)
     assert_close(losses, torch.tensor([24.0, 0.54 + 0.255, 0.01625, 16.0, 0.0], dtype=torch.float64))
     # Corner (0, 0, 0) has three outside neighbours: 2 * 3 * (1/2 - 1) + 2 * 1/2 = -2. In the middle only ballooning: 1.
     # Red of voxel (1, 1, 1): 2 * 6 * 0.3. Coefficient 4 of (2, 2, 2): 2 * 6 * 0.05 + 0.05; 9 of (1, 2, 1): -2.4 - 0.1.
@@ -47,34 +47,35 @@ def test_by_hand(device: str) -> None:
 def test_curvature_by_hand(device: str) -> None:
     # Values rise by 0.1 per voxel along x: the Laplacian is 0. A bump of 0.1 at (1, 2, 2) makes it -0.6 there and +0.1 at
     # the neighbours (1, 1, 2), (1, 2, 1) and (2, 2, 2); those at x = 0, y = 3 and z = 3 touch the outside and do not
-    # count. 0.36 + 3 * 0.01 = 0.39. Gradient at the bump: 2 (-6 * -0.6 + 3 * 0.1) = 7.8; at (0, 2, 2), whose own
-    # Laplacian is unknown, 2 * -0.6; at (2, 2, 2): 2 (-6 * 0.1 - 0.6) = -2.4; at (3, 2, 2): 2 * 0.1.
+    # count. Huber over 0.4: 0.4 (0.6 - 0.2) + 3 * 0.1^2 / 2 = 0.175; its derivatives are -0.4 and 0.1. Gradient at the
+    # bump: -6 * -0.4 + 3 * 0.1 = 2.7; at (0, 2, 2), whose own Laplacian is unknown, -0.4; at (2, 2, 2): -6 * 0.1 - 0.4 =
+    # -1.0; at (3, 2, 2): 0.1.
     voxels, table, frame = one_tile(degree=0, device=device)
     voxels[..., 0] = 0.3 + 0.1 * torch.arange(4, dtype=torch.float64, device=device).view(4, 1, 1)
     voxels[0, 1, 2, 2, 0] += 0.1
     coordinates = torch.ones(1, 3, dtype=torch.int32, device=device)
     gradient = torch.zeros_like(voxels)
-    losses = ops.voxel_terms(voxels, table, frame, coordinates, [0.0, 0.0, 0.0, 0.0, 1.0], 0.1, gradient)
-    assert losses[4].item() == pytest.approx(0.39)
+    losses = ops.voxel_terms(voxels, table, frame, coordinates, [0.0, 0.0, 0.0, 0.0, 1.0], 0.1, 0.4, gradient)
+    assert losses[4].item() == pytest.approx(0.175)
     for at, expected in {
-        (1, 2, 2): 7.8,
-        (0, 2, 2): -1.2,
-        (2, 2, 2): -2.4,
-        (3, 2, 2): 0.2,
+        (1, 2, 2): 2.7,
+        (0, 2, 2): -0.4,
+        (2, 2, 2): -1.0,
+        (3, 2, 2): 0.1,
         (0, 0, 0): 0.0,
     }.items():
         assert gradient[0][at][0].item() == pytest.approx(expected, abs=1e-12), at
     voxels[0, 2, 2, 2, 0] = frame[4]  # at its bound: nothing is known there and beside it, the bump included
-    losses = ops.voxel_terms(voxels, table, frame, coordinates, [0.0, 0.0, 0.0, 0.0, 1.0], 0.1, gradient)
-    assert losses[4].item() == pytest.approx(0.02)
+    losses = ops.voxel_terms(voxels, table, frame, coordinates, [0.0, 0.0, 0.0, 0.0, 1.0], 0.1, 0.4, gradient)
+    assert losses[4].item() == pytest.approx(0.01)
 
 
 def test_gradient_is_added(device: str) -> None:
     given = arguments("voxel_terms", make_scene(device=device))
-    fresh, added = torch.zeros_like(given[6]), given[6].clone()
-    ops.voxel_terms(*given[:6], fresh)
-    ops.voxel_terms(*given[:6], added)
-    assert_close(added - given[6], fresh.cpu())
+    fresh, added = torch.zeros_like(given[7]), given[7].clone()
+    ops.voxel_terms(*given[:7], fresh)
+    ops.voxel_terms(*given[:7], added)
+    assert_close(added - given[7], fresh.cpu())
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -83,7 +84,7 @@ def test_gradcheck(degree: int, device: str) -> None:
 
     def total(voxels: Tensor) -> Any:
         return VoxelTerms.apply(
-            voxels, scene.table, scene.frame, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1
+            voxels, scene.table, scene.frame, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1, 0.05
         )[0]
 
     assert torch.autograd.gradcheck(total, scene.voxels.requires_grad_(), fast_mode=True)
@@ -95,8 +96,8 @@ def test_wrong_arguments_are_named(device: str) -> None:
         (3, good[3][1:], "coordinates: expected shape"),
         (3, torch.zeros_like(good[3]), "coordinates: expected every tile inside"),
         (4, [1.0], "weights: expected"),
-        (6, good[6][..., :2], "gradient: expected shape"),
-        (6, good[6].transpose(1, 2), "gradient: is written in place and must be contiguous"),
+        (7, good[7][..., :2], "gradient: expected shape"),
+        (7, good[7].transpose(1, 2), "gradient: is written in place and must be contiguous"),
     ):
         with pytest.raises(RuntimeError, match=match):
             ops.voxel_terms(*good[:i], wrong, *good[i + 1 :])

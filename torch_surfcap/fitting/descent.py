@@ -21,6 +21,9 @@ REFRESH = 8.0  # iterations at full rate after which the integration ranges are 
 GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
 GROUPS = (4, 32)  # fewest, most
 PARSIMONY_HUBER = 0.1
+BEND = (
+    0.4  # voxels^-1, the sum of curvatures above which bending costs linearly: edges and thin parts survive
+)
 
 RAY_LOSSES = ("photo", "sample", "mask")
 VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
@@ -112,7 +115,7 @@ def descend(
         )
         watch.lap("march")
         voxel_losses = ops.voxel_terms(
-            store, grid.table, frame, grid.places, voxel_weights, PARSIMONY_HUBER, gradient
+            store, grid.table, frame, grid.places, voxel_weights, PARSIMONY_HUBER, BEND, gradient
         )
         watch.lap("voxels")
         adam.step(gradient, rule.scale)

@@ -114,7 +114,9 @@ def find_ranges(
     suits the opacity."""
     frame, shift = grid.frame(*MISSING[opacity]), origins.new_zeros(len(origins))
     level = QUIET[opacity] if quiet is None else quiet
-    return ops.integration_ranges(colorless(store), grid.table, frame, origins, directions, shift, *march, level)
+    return ops.integration_ranges(
+        colorless(store), grid.table, frame, origins, directions, shift, *march, level
+    )
 
 
 def _blocked(index: Tensor) -> Tensor:

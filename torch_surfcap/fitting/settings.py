@@ -19,7 +19,7 @@ class Losses:
     tv_color: float = 1e-3  # squared steps of the colour coefficients
     parsimony: float = 1e-3  # Huber norm of the view-dependent coefficients, eq. 11
     ballooning: float = 0.0  # squared opacity value, eq. 12
-    curvature: float = 3e-5  # squared Laplacian of the opacity value
+    curvature: float = 1e-4  # Huber norm of the Laplacian of the opacity value
     detach_sample: bool = False  # the sample loss moves colours only
 
 

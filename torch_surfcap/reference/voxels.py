@@ -22,14 +22,15 @@ def voxel_terms(
     coordinates: Tensor,
     weights: Sequence[float],
     huber: float,
+    bend: float,
     gradient: Tensor,
 ) -> Tensor:
     """Losses [5] in double, unweighted: TV of the opacity value, TV of colour, parsimony (eq. 11), ballooning
     (eq. 12), curvature (0 where its weight is); adds the gradient of weights · losses to `gradient` [T,4,4,4,P].
 
     TV sums (x_i - x_j)² over unordered pairs of 6-neighbours of which at least one is stored. A missing
-    neighbour has its boundary value for the opacity value and does not count for colour. The curvature sums the
-    squared 7-point Laplacian of the opacity value where all 7 lie strictly between the boundary values.
+    neighbour has its boundary value for the opacity value and does not count for colour. The curvature sums
+    Huber's norm of the 7-point Laplacian of the opacity value where all 7 lie strictly between the boundary values.
     coordinates [T,3] place the tiles in the table.
     """
     if not bool(
@@ -55,7 +56,7 @@ def voxel_terms(
     low, high = sorted(frame[4:6])
     known = torch.stack([(low < v) & (v < high) for v in star]).all(0) & (weights[4] != 0)
     laplacian = torch.stack(star[1:]).sum(0) - 6 * star[0]
-    curvature = (laplacian[known] ** 2).sum()
+    curvature = huber_norm(laplacian[known], bend).sum()
     losses = torch.stack([tv_opacity, tv_color, parsimony, ballooning, curvature])
     gradient += torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)[0]
     return losses.detach().double()
