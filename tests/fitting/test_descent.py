@@ -29,13 +29,21 @@ def threads() -> Iterator[None]:
 def test_plateau_by_hand() -> None:
     # Over two iterations the loss must fall by a tenth. 10 -> 8 does; 9 -> 8.5 does not: the rate is halved and the
     # memory starts anew, so that the next comparison is 6 with 8; it holds, as 6 -> 4; 4 -> 4 ends it.
-    rule = Plateau(limit=100, gain=0.1, window=2, factor=0.5, drops=2)
+    rule = Plateau(limit=100, gain=0.1, share=1.0, window=2, factor=0.5, drops=2)
     seen = []
     for loss in (10.0, 9.0, 8.0, 8.5, 8.0, 7.0, 6.0, 4.0, 4.0, 4.0):
         goes_on = rule.goes_on(loss)
         seen.append((rule.scale, goes_on))
     assert [scale for scale, _ in seen] == [1, 1, 1, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.25]
     assert [goes_on for _, goes_on in seen] == [True] * 9 + [False]
+
+
+def test_plateau_knows_what_cannot_be_explained() -> None:
+    """1 + 0.1 * 0.9^i falls by little of itself at once, but by a twentieth of its way only until 0.9^(i - 5) - 0.9^i =
+    0.69 * 0.9^i <= 0.05 (1 - 0.9^i), which is i = 26, the 27th iteration."""
+    for share, ends in ((1.0, 6), (0.05, 27)):
+        rule = Plateau(limit=1000, gain=0.05, share=share, drops=1)
+        assert sum(rule.goes_on(1.0 + 0.1 * 0.9**i) for i in range(1000)) + 1 == ends
 
 
 def test_plateau_ends_at_its_limit() -> None:

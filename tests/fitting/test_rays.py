@@ -119,7 +119,7 @@ def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
         torch.testing.assert_close(losses[1], losses[0], rtol=1e-3 if opacity == "distance" else 3e-3, atol=0)
         # Empty space far from the surface gets no gradient within a transparency's ranges.
         if opacity == "distance":
-            assert (gradients[1] - gradients[0]).norm() < 0.02 * gradients[0].norm()
+            assert (gradients[1] - gradients[0]).norm() < 0.05 * gradients[0].norm()
     covered = float((rays.ranges[1][:, 1] - rays.ranges[1][:, 0]).sum()) / len(rays)
     assert covered < 16 * march.step  # and they save something: the ball is 20 voxels thick, the grid 26
 

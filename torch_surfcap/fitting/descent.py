@@ -31,8 +31,11 @@ VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature"
 
 @dataclass
 class Plateau:
-    """When to lower the rates and when to end a level: each time the loss gained less than ``gain`` over ``window``
-    iterations the rates fall by ``factor``; the last of ``drops`` times ends the level, as do ``limit`` iterations.
+    """When to lower the rates and when to end a level.
+
+    Each time the loss fell, over ``window`` iterations, by less than ``gain`` of itself and by less than ``share`` of all
+    that it has fallen in this level (photographs leave a rest that no field explains), the rates fall by ``factor``; the
+    last of ``drops`` times ends the level, as do ``limit`` iterations.
 
     >>> rule = Plateau(limit=100)
     >>> sum(rule.goes_on(1.0) for _ in range(100))
@@ -41,21 +44,27 @@ class Plateau:
 
     limit: int
     gain: float = 0.02
+    share: float = 0.03
     window: int = 5
     factor: float = 0.3
     drops: int = 2
     scale: float = 1.0
     count: int = 0
+    first: float = 0.0
     losses: list[float] = field(default_factory=list)
 
     def goes_on(self, loss: float) -> bool:
         """Takes the loss of an iteration; whether another one follows."""
+        if self.count == 0:
+            self.first = loss
         self.losses.append(loss)
         self.count += 1
-        if len(self.losses) > self.window and loss > (1 - self.gain) * self.losses[-1 - self.window]:
-            self.drops -= 1
-            self.scale *= self.factor
-            self.losses.clear()
+        if len(self.losses) > self.window:
+            least = max(0.0, min(self.gain * loss, self.share * (self.first - loss)))
+            if self.losses[-1 - self.window] - loss <= least:
+                self.drops -= 1
+                self.scale *= self.factor
+                self.losses.clear()
         return self.drops > 0 and self.count < self.limit
 
 
