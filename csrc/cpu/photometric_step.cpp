@@ -38,6 +38,7 @@ StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, con
   const Tensor color = torch::stable::new_empty(voxels, {count, 3});
   const Tensor transmittance = torch::stable::new_empty(voxels, {count});
   const Tensor losses = torch::stable::new_zeros(voxels, {3}, ScalarType::Double);
+  advise_large_pages(total, groups * size * int64_t(sizeof(Real)));
   Real *const c = color.template mutable_data_ptr<Real>(), *const t = transmittance.template mutable_data_ptr<Real>();
   std::vector<double> by_group(size_t(groups) * 3, 0.0);
   const auto work = [&](int64_t begin, int64_t end, Real* buffer, int64_t group) {

@@ -75,6 +75,14 @@ def test_first_field_holds_the_ball(opacity: str, degree: int) -> None:
     assert not store[..., 4:].any()
 
 
+def test_a_box_of_too_many_voxels() -> None:
+    """Refused before anything of that size is allocated."""
+    with pytest.raises(
+        InputError, match=r"memory: the first level \(voxels of 1e-07\) needs .* GiB are free"
+    ):
+        first_field(ball(6, 16), BOX, 1e-7, "distance", 0)
+
+
 def test_nothing_in_the_box() -> None:
     far = (center + 5, center + 6)
     with pytest.raises(InputError, match="silhouettes: the visual hull is empty inside the box"):
@@ -102,7 +110,7 @@ def no_rays() -> RayBatch:
 def test_next_level_of_a_distance() -> None:
     """Half the voxel, so twice the distance in voxels; tiles along the surface only, solid ones behind it."""
     grid, store, normal, offset = plane()
-    fine, values = next_level(grid, store, "distance", no_rays(), 1.0, 0.0)
+    fine, values = next_level(grid, store, "distance", no_rays(), March(1, SLOPE, 1.0, 0.0))
     assert fine.voxel_size == 0.1
     assert fine.size == tuple(2 * n for n in grid.size)
     assert len(fine.coords) < 8 * len(grid.coords)
@@ -128,7 +136,7 @@ def test_next_level_of_a_steep_distance() -> None:
     """No hole where the distance leaps from one side to the other between two voxels, stored or missing."""
     grid, store, normal, offset = plane()
     store[..., 0] = torch.where(store[..., 0] < 0, -CLAMP, CLAMP)
-    fine, _ = next_level(grid, store, "distance", no_rays(), 1.0, 0.0)
+    fine, _ = next_level(grid, store, "distance", no_rays(), March(1, SLOPE, 1.0, 0.0))
     at = torch.tensor([[i, j, k] for i in range(32) for j in range(32) for k in range(32)])
     away = (at + 0.5).double() * 0.2 @ normal - offset
     surface = ((at > 0) & (at < 31)).all(1) & (
@@ -151,7 +159,7 @@ def test_next_level_leaves_empty_space_empty() -> None:
     grid, store = fog_around_ball()
     march = March(0, SLOPE, 0.04, 1e-3)
     rays = gather_rays(ball(side=32), store, grid, "transparency", march, torch.zeros(3))
-    fine, _ = next_level(grid, store, "transparency", rays, 0.04, 1e-3)
+    fine, _ = next_level(grid, store, "transparency", rays, march)
     inside = (fine.inside.nonzero().double() + 0.5) * 4 * fine.voxel_size + torch.tensor(fine.origin)
     assert len(inside) > 0
     assert ((inside - center).norm(dim=1) < RADIUS).all()
@@ -180,7 +188,7 @@ def test_next_level_of_a_transparency() -> None:
     store[..., 0] = torch.where(radius < RADIUS, ETA, 1.0)
     march = March(0, SLOPE, voxel, 1e-3)
     rays = gather_rays(capture, store, grid, "transparency", march, torch.zeros(3))
-    fine, values = next_level(grid, store, "transparency", rays, voxel, 1e-3)
+    fine, values = next_level(grid, store, "transparency", rays, march)
     assert fine.voxel_size == voxel / 2
     assert values.shape == (len(fine.coords), 4, 4, 4, 4)
     away = (voxel_centers(fine) - center).norm(dim=-1) - RADIUS

@@ -113,7 +113,7 @@ def test_budget_grows_with_levels_and_degree() -> None:
     bytes_by_degree = []
     for degree in (0, 1, 2):
         grid, store = first_field(capture, box, plan[0].voxel_size, "distance", degree)
-        budget = estimate(capture, plan, grid, store)
+        budget = estimate(capture, plan, grid, store, "distance")
         assert budget.level_bytes == sorted(budget.level_bytes)
         assert budget.level_bytes[0] > 4 * 3 * store.numel()
         bytes_by_degree.append(budget.level_bytes[-1])

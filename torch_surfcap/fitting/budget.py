@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import psutil
 import torch
@@ -12,14 +13,16 @@ from torch_surfcap import ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.descent import gradient_groups
-from torch_surfcap.fitting.levels import Level
+
+if TYPE_CHECKING:
+    from torch_surfcap.fitting.levels import Level
 
 BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
+SURFACE = {"transparency": 0.99, "distance": 0.0}  # opacity value on the hull's surface, where a fit starts
+AREA_PER_BORDER = 0.6  # voxel faces of area per voxel at the border of a ball, counted
 TILES_PER_AREA = 2.5  # stored tiles per tile face of surface, measured
 SAMPLES_PER_RAY = 8  # within the integration ranges, measured
-OVERHEAD = (
-    2.0  # levels run longer than the plan says, and there are ranges, voxel terms and the mesh, measured
-)
+OVERHEAD = 2.0  # levels run longer than planned, and there are ranges, voxel terms and the mesh, measured
 SAMPLE_SECONDS = {4: 60e-9, 16: 90e-9, 32: 130e-9}  # forward and backward on one core, by pitch, measured
 RAY_MARGIN = 1.3  # rays per pixel of the silhouettes
 
@@ -32,12 +35,12 @@ class Budget:
     seconds: float
 
 
-def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor) -> Budget:
+def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor, opacity: str) -> Budget:
     """The budget of a fit whose first level has this grid: surfaces grow by 4 per level, and so do pictures."""
     assert capture.masks is not None
     pixels = sum(float(mask.sum()) for mask in capture.masks)
     pitch = store.shape[-1]
-    area = _surface_tiles(grid, store)
+    area = _surface_tiles(grid, store[..., 0] < SURFACE[opacity])
     level_bytes, samples = [], 0.0
     for number, level in enumerate(plan):
         tiles = len(store) if number == 0 else TILES_PER_AREA * area * 4**number
@@ -59,9 +62,6 @@ def shortage(needed: int) -> str | None:
     )
 
 
-def _surface_tiles(grid: TileGrid, store: Tensor) -> float:
-    """Area of the hull's surface in tile faces: faces between stored voxels inside and outside, a third too many."""
-    value = store[..., 0]
-    inside = value < (0.0 if float(value.max()) > 1.0 or float(value.min()) < 0.0 else 0.99)
-    faces = sum(float((inside.diff(dim=axis) != 0).sum()) for axis in (1, 2, 3))
-    return faces * 4 / 3 / 1.5 / ops.TILE**2
+def _surface_tiles(grid: TileGrid, within: Tensor) -> float:
+    """Area of the border of the stored voxels [T, 4, 4, 4] that are within, in tile faces."""
+    return float(grid.borders(within).sum()) * AREA_PER_BORDER / ops.TILE**2

@@ -90,14 +90,14 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
     backdrop = choose_backdrop(capture)
     grid, store = first_field(pictures[plan[0].halvings], box, plan[0].voxel_size, s.opacity, degree)
     watch.lap("hull")
-    budget = estimate(capture, plan, grid, store)
+    budget = estimate(capture, plan, grid, store, s.opacity)
     report(Progress(0, len(plan), plan[0], 0, {}, budget))
 
     history: list[dict[str, float]] = []
     warnings = list(capture.warnings)
     by_level: list[dict[str, float]] = []
     generator = torch.Generator().manual_seed(s.seed)
-    rays = None
+    rays, march = None, None
     for number, level in enumerate(plan):
         missing = shortage(budget.level_bytes[number])
         if missing:
@@ -108,10 +108,10 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
             break
         spent: dict[str, float] = {}
         level_watch = Stopwatch(spent)
+        if rays is not None and march is not None:
+            grid, store = next_level(grid, store, s.opacity, rays, march)
         step = s.descent.last_step if number == len(plan) - 1 else s.descent.step
         march = March(ops.OPACITY[s.opacity], SLOPE, step * level.voxel_size, s.descent.stop)
-        if rays is not None:
-            grid, store = next_level(grid, store, s.opacity, rays, 2 * march.step, march.stop)
         rays = gather_rays(pictures[level.halvings], store, grid, s.opacity, march, backdrop)
         level_watch.lap("prepare")
         for row in descend(store, grid, rays, s, march, level.iterations, generator, spent):
@@ -129,7 +129,7 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
     chosen = {
         "sh_degree": {"value": degree, "reason": "default" if s.sh_degree is None else "given"},
         "voxel": {
-            "value": plan[-1].voxel_size,
+            "value": surface.voxel_size,
             "reason": "a pixel's footprint" if s.voxel is None else "given",
         },
         "levels": {"value": len(by_level), "reason": "size of the pictures" if s.levels is None else "given"},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -9,16 +10,19 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
 from torch_surfcap import ops
+from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.errors import InputError
-from torch_surfcap.field.field import CLAMP, MISSING, SLOPE
+from torch_surfcap.field.field import CLAMP, MISSING
 from torch_surfcap.field.hull import Silhouettes, find_box, pixel_footprint
 from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.budget import shortage
 from torch_surfcap.fitting.rays import QUIET, RayBatch
 
 ITERATIONS = (60, 40, 30, 20)  # from the fourth-finest level to the finest: a scale, not a limit
 SMALLEST_IMAGE = 32  # pixels along the shorter side of the coarsest pictures
 MARGIN = 2  # coarse voxels around the subject's box
+DENSE_BYTES = 100  # per voxel of the box, while the first field is made: points, hull and distances
 FOG = 0.98  # transparency that the hull is filled with
 BAND = (
     0.5  # voxels on either side of a signed distance's zero that the next level follows, with a margin of one
@@ -77,6 +81,9 @@ def first_field(
     edge = ops.TILE * voxel_size
     corner = low - MARGIN * voxel_size
     size = [int(n) for n in torch.ceil((high - low + 2 * MARGIN * voxel_size) / edge)]
+    missing = shortage(DENSE_BYTES * ops.TILE**3 * math.prod(size))
+    if missing:
+        raise InputError(f"memory: the first level (voxels of {voxel_size:.4g}) {missing}")
     x, y, z = corner.tolist()
     steps = [(torch.arange(n * ops.TILE, dtype=torch.float64) + 0.5) * voxel_size for n in size]
     points = torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + corner
@@ -107,9 +114,9 @@ def _tilewise(voxels: Tensor) -> Tensor:
 
 
 def next_level(
-    grid: TileGrid, store: Tensor, opacity: str, rays: RayBatch, step: float, stop: float
+    grid: TileGrid, store: Tensor, opacity: str, rays: RayBatch, march: March
 ) -> tuple[TileGrid, Tensor]:
-    """Grid and records at half the voxel size.
+    """Grid and records at half the voxel size; ``rays`` and ``march`` are those of the level that is done.
 
     A signed distance knows where its surface is. A transparency does not: its surface is where samples have weight,
     and what no camera's light reaches is solid (paper, section 4.2).
@@ -122,7 +129,6 @@ def next_level(
         surface = (store[..., 0].abs() < BAND) | grid.borders(solid)
     else:
         shift = torch.zeros_like(rays.mask)
-        march = (ops.OPACITY[opacity], SLOPE, step, stop)
         seen = ops.visibility(store, grid.table, frame, rays.origins, rays.directions, shift, *march)
         surface = seen[..., 1] > SEEN
         solid = (seen[..., 0] < SEEN) & (store[..., 0] < QUIET[opacity])
