@@ -112,17 +112,9 @@ def fused_forward(scene: Scene) -> Tensor:
 
 def fused_step(scene: Scene) -> Result:
     """This library's step."""
-    arguments: list[Any] = [
-        *scene.field_and_rays(),
-        *scene.seen,
-        *MARCH,
-        HUBER,
-        WEIGHTS,
-        False,
-        ops.GROUPS,
-        None,
-    ]
-    losses, gradient, _, _ = ops.photometric_step(*arguments)
+    losses, gradient, _, _ = ops.photometric_step(
+        *scene.field_and_rays(), *scene.seen, *MARCH, HUBER, WEIGHTS, gradients=scene.gradients
+    )
     return losses, gradient
 
 
