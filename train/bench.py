@@ -112,9 +112,9 @@ def fused_forward(scene: Scene) -> Tensor:
 
 def fused_step(scene: Scene) -> Result:
     """This library's step."""
-    losses, gradient, _, _ = ops.photometric_step(
-        *scene.field_and_rays(), *scene.seen, *MARCH, HUBER, WEIGHTS, gradients=scene.gradients
-    )
+    terms: list[Any] = [HUBER, WEIGHTS, False, ops.GROUPS, None, scene.gradients]
+    arguments = [*scene.field_and_rays(), *scene.seen, *MARCH, *terms]
+    losses, gradient, _, _ = ops.photometric_step(*arguments)
     return losses, gradient
 
 
