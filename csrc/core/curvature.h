@@ -1,7 +1,8 @@
 // The curvature of the opacity value: Huber's norm of the 7-point Laplacian, over the voxels where it is known, namely
 // where the voxel and its 6 neighbours lie strictly between the two boundary values. Missing voxels never do, nor do
-// clamped distances. Along a signed distance's normal it vanishes, so that, unlike total variation, it neither pulls a
-// plane nor shrinks a ball to first order: what it costs is bending. Huber's norm spares edges and thin parts.
+// clamped distances. A signed distance has no second derivative along its normal, so its Laplacian is the sum of the
+// surface's curvatures: unlike total variation the term neither pulls a plane nor shrinks a ball to first order, it
+// costs bending. Huber's norm spares edges and thin parts.
 #pragma once
 
 #include "field.h"
@@ -19,11 +20,9 @@ SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t t
   const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
   const Real low = smaller(field.missing[0], field.missing[1]), high = larger(field.missing[0], field.missing[1]);
 
-  // One number more at either end: rows along z are also read one to the left and one to the right.
-  // bend: the norm's derivative by the Laplacian.
-  Real values[kSide * kSide * kSide + 2], bends[kSide * kSide * kSide + 2];
-  Real *const value = values + 1, *const bend = bends + 1;
-  values[0] = values[kSide * kSide * kSide + 1] = bends[0] = bends[kSide * kSide * kSide + 1] = Real(0);
+  // bend: the norm's derivative by the Laplacian. Only rows with x and y in 1..6 are read with those around them, so
+  // the shifted rows along z never leave the arrays.
+  Real value[kSide * kSide * kSide], bend[kSide * kSide * kSide];
   for (int x = 0; x < kSide; ++x) {
     for (int y = 0; y < kSide; ++y) {
       const int64_t column = cell + ((x + kHalo) / kTile - 1) * stride[0] + ((y + kHalo) / kTile - 1) * stride[1];

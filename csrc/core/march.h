@@ -116,7 +116,7 @@ template <class Real, int Degree, class Opacity> struct Walk {
   }
 };
 
-// `term(sample, dc)` returns a sample's r_k and adds to lanes 1..3 of dc the loss's derivative by its colour per unit
+// `term(sample, dc)` returns a sample's r_k and sets lanes 1..3 of dc to the loss's derivative by its colour per unit
 // of weight w_k (what is left out of r_k does not move the weights). Gradients are scattered into `gradient`.
 template <class Real, int Degree, class Opacity, class Term>
 SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const Opacity& opacity,

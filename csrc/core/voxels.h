@@ -14,8 +14,7 @@ inline namespace SURFCAP_ISA {
 //   parsimony (eq. 11)  sum of Huber(b_lm), l > 0          ballooning (eq. 12)  sum of the opacity value squared
 //   curvature of the opacity value, see there; left out where its weight is 0
 // A missing neighbour counts with its boundary value for the opacity and not at all for colour: black would bleed in.
-// losses: tv opacity, tv colour, parsimony, ballooning, curvature, unweighted. The squares are those of the pairs that
-// this tile meets.
+// losses: tv opacity, tv colour, parsimony, ballooning, curvature, unweighted.
 template <class Real, int Degree>
 SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordinate, const VoxelTerms<Real>& terms,
                                  int64_t tile, double* losses, Real* gradient) {
@@ -35,7 +34,7 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
     tv_row[i] = i == 0 ? terms.tv_opacity : is_color[i] * terms.tv_color;
     parsimony_row[i] = i > 3 && i < R::kCoefficients ? Real(1) : Real(0);
   }
-  P squares[R::kParts];  // sum over pairs met of half the squared difference
+  P squares[R::kParts];  // over the pairs met; a pair of two stored voxels is met from both
   for (int p = 0; p < R::kParts; ++p) squares[p] = zero_pack<Real, R::kPart>();
   Real parsimony = Real(0), ballooning = Real(0), boundary = Real(0);
 

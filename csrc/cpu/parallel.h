@@ -17,8 +17,8 @@ namespace surfcap {
 
 constexpr int64_t kChunk = 256;  // rays or points that one group takes at a time, to even out the load
 
-// Asks for large pages under a large, still untouched buffer: the march reads and writes it at random, and would
-// otherwise wait for address translation more than for data.
+// Asks for large pages under a large buffer, before it is first touched: the march reads and writes it at random, and
+// would otherwise wait for address translation more than for data.
 inline void advise_large_pages(void* data, int64_t bytes) {
 #if defined(__linux__)
   constexpr uintptr_t kPage = uintptr_t(2) << 20;

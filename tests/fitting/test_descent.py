@@ -54,7 +54,15 @@ def test_plateau_ends_at_its_limit() -> None:
 
 def test_plateau_takes_rising_for_standing() -> None:
     rule = Plateau(limit=1000, window=3, drops=1)
-    assert sum(rule.goes_on(1.0 + i) for i in range(1000)) == 3
+    assert sum(rule.goes_on(1.0 + i) for i in range(1000)) == 2 * 3 + 3 - 1
+
+
+def test_plateau_forgives_an_overshoot() -> None:
+    """A loss that first leaps up and then falls steadily costs no rate, and its way begins at the leap."""
+    rule = Plateau(limit=1000)
+    for i in range(12):
+        assert rule.goes_on(571.0 if i == 0 else 500.0 + 1000.0 * 0.7 ** (i - 1))
+    assert (rule.scale, rule.top) == (1.0, 1500.0)
 
 
 def test_groups_follow_from_the_size_alone(threads: None) -> None:

@@ -94,7 +94,8 @@ def test_what_rays_should_see() -> None:
 
 @pytest.mark.parametrize("opacity", OPACITIES)
 def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
-    """Found for unshifted samples they serve every shift of up to half a step: losses and gradient stay the same.
+    """Found for unshifted samples they serve every shift of up to half a step: losses stay the same, and all but a
+    twentieth of the gradient; samples beyond 1.5 voxels of distance, of 0.25 % opacity each, have it.
 
     The values of a transparency may dip between the samples that the ranges were found by: a little more is lost there.
     """

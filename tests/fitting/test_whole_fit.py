@@ -148,6 +148,8 @@ def test_a_level_without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     result = fit(ball(6, 32), sh_degree=0, levels=2, voxel=0.05)
     assert any("level 2 of 2" in warning and "needs too much" in warning for warning in result.warnings)
     assert result.field.voxel_size == 0.1
+    assert result.chosen["voxel"] == {"value": 0.1, "reason": "memory"}
+    assert result.chosen["levels"] == {"value": 1, "reason": "memory"}
     assert np.abs(errors(result.mesh)).max() < 2 * 0.1
 
 

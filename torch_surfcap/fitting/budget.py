@@ -51,15 +51,15 @@ def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor,
     return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
 
 
-def shortage(needed: int) -> str | None:
-    """What is missing for so many bytes, and what would help; None where they are free."""
+LESS = "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"
+
+
+def shortage(needed: int, remedy: str = LESS) -> str | None:
+    """What is missing for so many bytes, and the remedy; None where they are free."""
     free = psutil.virtual_memory().available
     if needed <= free:
         return None
-    return (
-        f"needs {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: "
-        "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"
-    )
+    return f"needs {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: {remedy}"
 
 
 def _surface_tiles(grid: TileGrid, within: Tensor) -> float:

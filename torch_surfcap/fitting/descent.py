@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -33,9 +34,10 @@ VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature"
 class Plateau:
     """When to lower the rates and when to end a level.
 
-    Each time the loss fell, over ``window`` iterations, by less than ``gain`` of itself and by less than ``share`` of all
-    that it has fallen in this level (photographs leave a rest that no field explains), the rates fall by ``factor``; the
-    last of ``drops`` times ends the level, as do ``limit`` iterations.
+    Each time the loss fell, over ``window`` iterations, by no more than ``gain`` of itself and no more than ``share`` of
+    its way since the top (photographs leave a rest that no field explains), the rates fall by ``factor``; the last of
+    ``drops`` times ends the level, as do ``limit`` iterations. The top is where the loss was highest in the first two
+    windows: after a change of level Adam's first steps overshoot.
 
     >>> rule = Plateau(limit=100)
     >>> sum(rule.goes_on(1.0) for _ in range(100))
@@ -50,17 +52,18 @@ class Plateau:
     drops: int = 2
     scale: float = 1.0
     count: int = 0
-    first: float = 0.0
+    top: float = -math.inf
     losses: list[float] = field(default_factory=list)
 
     def goes_on(self, loss: float) -> bool:
         """Takes the loss of an iteration; whether another one follows."""
-        if self.count == 0:
-            self.first = loss
-        self.losses.append(loss)
         self.count += 1
+        if loss > self.top and self.count <= 2 * self.window:
+            self.top = loss
+            self.losses.clear()
+        self.losses.append(loss)
         if len(self.losses) > self.window:
-            least = max(0.0, min(self.gain * loss, self.share * (self.first - loss)))
+            least = max(0.0, min(self.gain * loss, self.share * (self.top - loss)))
             if self.losses[-1 - self.window] - loss <= least:
                 self.drops -= 1
                 self.scale *= self.factor

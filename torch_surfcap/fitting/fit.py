@@ -126,13 +126,17 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
         raise InputError("surface: the fit ended without any, expected a subject inside the silhouettes")
     seconds["levels"] = by_level
     identity = torch.ones(len(capture), 3)
+    cut = "memory" if len(by_level) < len(plan) else None
     chosen = {
         "sh_degree": {"value": degree, "reason": "default" if s.sh_degree is None else "given"},
         "voxel": {
             "value": surface.voxel_size,
-            "reason": "a pixel's footprint" if s.voxel is None else "given",
+            "reason": cut or ("a pixel's footprint" if s.voxel is None else "given"),
         },
-        "levels": {"value": len(by_level), "reason": "size of the pictures" if s.levels is None else "given"},
+        "levels": {
+            "value": len(by_level),
+            "reason": cut or ("size of the pictures" if s.levels is None else "given"),
+        },
         "box": {
             "value": [*box[0].tolist(), *box[1].tolist()],
             "reason": "silhouettes" if s.box is None else "given",

@@ -81,7 +81,8 @@ def first_field(
     edge = ops.TILE * voxel_size
     corner = low - MARGIN * voxel_size
     size = [int(n) for n in torch.ceil((high - low + 2 * MARGIN * voxel_size) / edge)]
-    missing = shortage(DENSE_BYTES * ops.TILE**3 * math.prod(size))
+    remedy = "voxels 1.3 times as large or one level more halve it"
+    missing = shortage(DENSE_BYTES * ops.TILE**3 * math.prod(size), remedy)
     if missing:
         raise InputError(f"memory: the first level (voxels of {voxel_size:.4g}) {missing}")
     x, y, z = corner.tolist()
@@ -119,7 +120,7 @@ def next_level(
     """Grid and records at half the voxel size; ``rays`` and ``march`` are those of the level that is done.
 
     A signed distance knows where its surface is. A transparency does not: its surface is where samples have weight,
-    and what no camera's light reaches is solid (paper, section 4.2).
+    and what no camera's light reaches is solid (paper, section 4.2), unless it is as good as empty: no ray came by.
     """
     outside, inside = MISSING[opacity]
     frame = grid.frame(outside, inside)
