@@ -61,7 +61,7 @@ def gather_rays(
     distance = (cameras.centers - center).norm(dim=1)
     focal = torch.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
     pixels_per_voxel = grid.voxel_size * focal / distance
-    store = colorless(store)
+    store = colorless(store)  # once, not anew for every camera
     parts: list[tuple[Tensor, ...]] = []
     starts, counts, ranges = [0], [], []
     for i, mask in enumerate(capture.masks):
