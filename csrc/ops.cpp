@@ -15,7 +15,7 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
   m.def("photometric_step(" FIELD ", " RAYS
         ", Tensor target, Tensor mask, Tensor weight, "
         "Tensor? range_offsets, Tensor? ranges, " MARCH
-        ", float huber, float[] weights, bool detach_sample, Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
+        ", float huber, float[] weights, bool detach_sample, bool rendered_sample, Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
   m.def("integration_ranges(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH
         ", float quiet) -> (Tensor, Tensor)");
   m.def("visibility(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH ", int groups) -> Tensor");

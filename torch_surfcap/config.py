@@ -22,7 +22,7 @@ from torch_surfcap.data.files import atomic_write
 from torch_surfcap.data.readers import FORMATS
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import MISSING
-from torch_surfcap.fitting.settings import LOSSES, FitSettings
+from torch_surfcap.fitting.settings import CHOICES, LOSSES, SAMPLE_TARGETS, FitSettings
 
 
 def _one_of(default: Any, *values: Any) -> Any:
@@ -60,6 +60,8 @@ class LossesConfig:
     ballooning: float | None = _within(None, 0)  # weight of the squared opacity value
     curvature: float | None = _within(None, 0)  # weight of the bending of the opacity value
     detach_sample: bool | None = None  # the sample loss moves colours only
+    sample_target: str | None = _one_of(None, *SAMPLE_TARGETS)  # what samples are held against
+    anneal: bool | None = None  # ballooning falls with the rates towards the end of a level
 
 
 @dataclass
@@ -97,12 +99,19 @@ class Config:
     voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
     opacity: str | None = _one_of(None, *LOSSES)  # what a voxel stores
+    gains: str = _one_of("auto", *CHOICES["gains"])  # gain and bias per camera
+    gain_per: str = _one_of("channel", *CHOICES["gain_per"])  # what has a gain and bias of its own
+    start: str | None = _one_of(None, *CHOICES["start"])  # the first field of a transparency
+    upscale: str | None = _one_of(None, *CHOICES["upscale"])  # of a transparency to the next level
     losses: LossesConfig = field(default_factory=LossesConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
     overwrite: bool = False  # replace the results in `out`
     resume: bool = False  # go on from the checkpoint in `out`
+    checkpoint: float = _within(
+        60.0, 0
+    )  # seconds between checkpoints; there is one at every change of level too
 
 
 def load(path: str | os.PathLike[str] | None = None, overrides: Sequence[str] = ()) -> Config:
@@ -125,12 +134,16 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Sequence[str] = 
         except (OmegaConfBaseException, YAMLError, ValueError) as error:
             raise InputError(f"{override}: not YAML: {error}") from error
         merged = _merge(merged, given, override)
+    return _to_config(merged, str(path or "settings"))
+
+
+def _to_config(merged: DictConfig, source: str) -> Config:
     try:
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
-        raise InputError(f"{path or 'settings'}: {error}") from error
+        raise InputError(f"{source}: {error}") from error
     assert isinstance(config, Config)
-    _check(config, str(path or "settings"))
+    _check(config, source)
     return config
 
 
@@ -142,6 +155,10 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "sh_degree": config.sh_degree,
         "voxel": config.voxel,
         "levels": config.levels,
+        "gains": config.gains,
+        "gain_per": config.gain_per,
+        "start": config.start,
+        "upscale": config.upscale,
         "box": None if config.data.box is None else tuple(config.data.box),
         "seed": config.seed,
         "threshold": config.mesh.threshold,
@@ -167,6 +184,8 @@ def resolved(config: Config) -> Config:
     return replace(
         config,
         opacity=s.opacity,
+        start=s.start,
+        upscale=s.upscale,
         losses=LossesConfig(**vars(s.losses)),
         descent=DescentConfig(**vars(s.descent)),
         mesh=MeshConfig(s.threshold, s.smooth, s.specks),
@@ -179,10 +198,22 @@ def differences(a: Config, b: Config) -> dict[str, tuple[Any, Any]]:
     return {key: (left[key], right[key]) for key in left if left[key] != right[key]}
 
 
+def to_yaml(config: Config) -> str:
+    """Every setting as YAML; :func:`of_yaml` gives the same Config back."""
+    return OmegaConf.to_yaml(_replace(_plain(config), None, "auto"))
+
+
+def of_yaml(text: str, source: str) -> Config:
+    """The config of YAML text; ``source`` names it in errors."""
+    given = OmegaConf.create(text)
+    assert isinstance(given, DictConfig)
+    return _to_config(_merge(OmegaConf.structured(Config), given, source), source)
+
+
 def save(config: Config, path: str | os.PathLike[str]) -> None:
     """Write every setting as YAML; `load` gives the same Config back."""
     with atomic_write(path) as partial:
-        partial.write_text(OmegaConf.to_yaml(_replace(_plain(config), None, "auto")), encoding="utf-8")
+        partial.write_text(to_yaml(config), encoding="utf-8")
 
 
 def key_names(schema: Any = Config, prefix: str = "") -> Iterator[str]:
@@ -278,4 +309,4 @@ def _check(config: Any, source: str, prefix: str = "") -> None:
 
 
 # Fields in which "auto" is a word like any other.
-_SAYS_AUTO = {"data.format", "device"}
+_SAYS_AUTO = {"data.format", "device", "gains"}

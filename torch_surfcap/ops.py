@@ -145,6 +145,7 @@ def photometric_step(
     groups: int = GROUPS,
     ranges: tuple[Tensor, Tensor] | None = None,
     gradients: Tensor | None = None,
+    rendered_sample: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Value and gradient of the ray losses in one call.
 
@@ -154,6 +155,7 @@ def photometric_step(
         weights: of the photometric loss sum Huber(C - target) (eq. 8), of the sample loss
             sum_k w_k Huber(c_k - target) (eq. 10, observed colour) and of the mask loss (T - (1 - mask))^2.
         detach_sample: the sample loss's w_k carry no gradient.
+        rendered_sample: samples are held against the ray's own rendered colour, taken for a constant, not the target.
         ranges: of the rays, as :func:`integration_ranges` gives them; they save the search for non-empty cells.
         gradients: [groups, T, 4, 4, 4, P], memory for the partial gradients; the first one receives the sum, which is what
             is returned. Allocated where not given.
@@ -167,7 +169,7 @@ def photometric_step(
         (origins, directions, shift, background),
         (target, mask, weight),
     )
-    march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample)
+    march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample, rendered_sample)
     stretches = ranges or (None, None)
     if gradients is None:
         gradients = voxels.new_empty(groups, *voxels.shape)

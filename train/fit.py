@@ -4,7 +4,8 @@
 
 Keys and their meaning stand in torch_surfcap/config.py. Writes into OUT mesh.ply, mesh.glb, field.npz, config.yaml (with
 the defaults that were used), preview.png, history.csv (a line per iteration) and metrics.json: all of them, once the fit
-is done, or none. Exit 0 when they are written, 2 for bad input, 130 when interrupted.
+is done, or none. Meanwhile there is OUT/checkpoint.npz: resume=true goes on from it after whatever ended the run. Exit 0
+when the results are written, 2 for bad input, 130 when interrupted.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from torch_surfcap import report
 from torch_surfcap.config import Config
 from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.errors import InputError
+from torch_surfcap.fitting.checkpoint import Checkpoints
 from torch_surfcap.fitting.fit import FitResult, Progress, fit
 
 RESULTS = ("mesh.ply", "mesh.glb", "field.npz", "config.yaml", "preview.png", "history.csv", "metrics.json")
@@ -42,7 +44,14 @@ EVALUATED = (
     "error.ply",
     "error.png",
 )  # by evaluate.py; they go with the results they are of
-FREE_KEYS = {"out", "device", "overwrite", "resume"}  # may differ between a run and its resumption
+CHECKPOINT = "checkpoint.npz"
+FREE_KEYS = {
+    "out",
+    "device",
+    "overwrite",
+    "resume",
+    "checkpoint",
+}  # may differ between a run and its resumption
 SHOWN = {"psnr_volume": "PSNR volume", "psnr_raster": "PSNR raster", "psnr_masked": "PSNR masked"}
 
 
@@ -60,7 +69,10 @@ def main(arguments: Sequence[str] | None = None, started: float = 0.0) -> int:
         print(error, file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("interrupted, nothing was written", file=sys.stderr)
+        print(
+            "interrupted, no results were written; resume=true goes on from the last checkpoint",
+            file=sys.stderr,
+        )
         return 130
     return 0
 
@@ -76,7 +88,9 @@ def run(config: Config, started: float = 0.0) -> None:
     seconds: dict[str, Any] = {"total": 0.0, "start": started, "load": time.perf_counter() - start}
     with closing(Bars()) as bars:
         device = "cpu" if config.device == "auto" else config.device
-        result = fit(capture, bars, device=device, **settings.fit_arguments(config))
+        label = settings.to_yaml(config)
+        checkpoints = Checkpoints(out / CHECKPOINT, config.checkpoint, config.resume, label)
+        result = fit(capture, bars, checkpoints, device=device, **settings.fit_arguments(config))
     for warning in result.warnings[len(capture.warnings) :]:
         print(f"warning: {warning}")
     seconds |= result.seconds
@@ -124,20 +138,27 @@ def _check_out(out: Path, config: Config) -> None:
         nearest = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
         with tempfile.TemporaryFile(dir=nearest):
             pass
-        found = [name for name in RESULTS if (out / name).exists()]
+        found = [name for name in (*RESULTS, CHECKPOINT) if (out / name).exists()]
     except OSError as error:
         raise InputError(f"out: {out} cannot be written to ({error.strerror}), expected a folder") from error
     if found and not (config.overwrite or config.resume):
         expected = "expected another folder, overwrite=true or resume=true"
-        raise InputError(f"out: {out} holds the results of an earlier run ({found[0]}), {expected}")
+        what = "a checkpoint" if found == [CHECKPOINT] else "the results"
+        raise InputError(f"out: {out} holds {what} of an earlier run ({found[0]}), {expected}")
     if config.resume:
+        saved = Checkpoints(out / CHECKPOINT, resume=True).load()
+        if saved is not None:
+            earlier = settings.of_yaml(saved.label, str(out / CHECKPOINT))
+            _check_same(out / CHECKPOINT, earlier, config)
+            level, iteration = saved.place
+            print(f"{out}: resumed at iteration {iteration} of level {level + 1}")
+            return
         if "config.yaml" in found and not config.overwrite:
-            _check_same(out / "config.yaml", config)
+            _check_same(out / "config.yaml", settings.load(out / "config.yaml"), config)
         print(f"{out}: no checkpoint there, the fit starts afresh")
 
 
-def _check_same(path: Path, config: Config) -> None:
-    earlier = settings.load(path)
+def _check_same(path: Path, earlier: Config, config: Config) -> None:
     for key, (then, now) in settings.differences(earlier, config).items():
         if key not in FREE_KEYS:
             raise InputError(
@@ -180,8 +201,8 @@ def _metrics(result: FitResult, capture: Capture, seconds: dict[str, Any]) -> di
         "triangles": len(result.mesh.faces),
         "chosen": result.chosen,
         "warnings": result.warnings,
-        "resumed_from": None,
-        "iterations_run": len(result.history),
+        "resumed_from": result.resumed_from,
+        "iterations_run": result.iterations_run,
     }
 
 
@@ -210,6 +231,7 @@ def _write(
                 (out / name).unlink(missing_ok=True)
             for name in RESULTS:
                 os.replace(aside / name, out / name)
+            (out / CHECKPOINT).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"out: {out} cannot be written to ({error.strerror or error})") from error
     finally:

@@ -119,12 +119,13 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
   const Real excess = ray.transmittance - Real(1) + seen.mask[i];
   const Real r_inf = dot_color<Real>(by_color, background) + Real(2) * weight * loss.mask * excess;
   const Real sample_weight = weight * loss.sample;
+  const Pack<Real, 4> own_target = loss.rendered_sample ? rendered : target;
   Real sample_loss = Real(0);
   const auto term = [&](const Sample<Real, Opacity>& sample, Pack<Real, 4>& dc) {
     Real distance = Real(0);
     for (int c = 1; c < 4; ++c) {
       Real derivative;
-      distance += huber(sample.color[c] - target[c], loss.huber, derivative);
+      distance += huber(sample.color[c] - own_target[c], loss.huber, derivative);
       dc[c] = by_color[c] + sample_weight * derivative;
     }
     sample_loss += (Real(1) - sample.a) * sample.transmittance * distance;

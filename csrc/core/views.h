@@ -45,6 +45,7 @@ template <class Real> struct PhotometricSettings {
   Real huber;                // where Huber's norm turns linear
   Real photo, sample, mask;  // weights of the losses
   bool detach_sample;        // the weights w_k of the sample loss carry no gradient
+  bool rendered_sample;      // the sample loss compares with the rendered colour instead of the photograph's
 };
 
 template <class Real> struct VoxelTerms {

@@ -16,7 +16,7 @@ StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, con
                                   const Tensor& weight, const std::optional<Tensor>& range_offsets,
                                   const std::optional<Tensor>& ranges, int64_t opacity, double slope, double step,
                                   double stop, double huber, const std::vector<double>& weights, bool detach_sample,
-                                  const Tensor& gradients) {
+                                  bool rendered_sample, const Tensor& gradients) {
   const FieldArgument<Real> field(voxels, table, frame);
   RaysArgument<Real> rays(origins, directions, shift, background);
   const RangesArgument<Real> stretches(range_offsets, ranges, rays.view);
@@ -28,7 +28,8 @@ StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, con
   STD_TORCH_CHECK(weights.size() == 3, "weights: expected [photo, sample, mask], got ", weights.size(), " numbers");
   const Observation<Real> seen{photograph.data(), silhouette.data(), importance.data()};
   const PhotometricSettings<Real> loss{Real(huber), Real(weights[0]), Real(weights[1]), Real(weights[2]),
-                                       detach_sample};
+                                       detach_sample,
+ rendered_sample};
 
   const int64_t groups = gradients.dim() > 0 ? gradients.size(0) : 0, size = field.voxels.tensor().numel();
   STD_TORCH_CHECK(groups >= 1, "gradients: expected [groups, *voxels.shape] with at least one group, got ",
@@ -55,10 +56,10 @@ StepResult photometric_step(Tensor voxels, Tensor table, std::vector<double> fra
                             Tensor shift, Tensor background, Tensor target, Tensor mask, Tensor weight,
                             std::optional<Tensor> range_offsets, std::optional<Tensor> ranges, int64_t opacity,
                             double slope, double step, double stop, double huber, std::vector<double> weights,
-                            bool detach_sample, Tensor gradients) {
+                            bool detach_sample, bool rendered_sample, Tensor gradients) {
   return SURFCAP_BY_TYPE(voxels, photometric_step_typed, voxels, table, frame, origins, directions, shift, background,
                          target, mask, weight, range_offsets, ranges, opacity, slope, step, stop, huber, weights,
-                         detach_sample, gradients);
+                         detach_sample, rendered_sample, gradients);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("photometric_step", TORCH_BOX(&photometric_step)); }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,13 +11,13 @@ from torch import Tensor
 
 from tests.fitting.sphere import ball
 from torch_surfcap import ops
-from torch_surfcap.autograd import March
-from torch_surfcap.field.field import SLOPE
 from torch_surfcap.fitting.adam import BOUNDS, TileAdam
-from torch_surfcap.fitting.descent import GROUP_BYTES, GROUPS, Plateau, descend, gradient_groups
+from torch_surfcap.fitting.budget import GROUP_BYTES, GROUPS, gradient_groups
+from torch_surfcap.fitting.descent import descend
 from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
-from torch_surfcap.fitting.rays import choose_backdrop, gather_rays
+from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.settings import Descent, FitSettings
+from torch_surfcap.fitting.stage import begin_stage, open_studio
 
 
 @pytest.fixture
@@ -109,18 +110,15 @@ def run(opacity: str, iterations: int) -> tuple[Tensor, list[dict[str, float]]]:
     """A level of a small ball from its hull on."""
     capture = ball(6, 32)
     box = subject_box(capture, None)
-    level = plan_levels(capture, box, 0.06, 1)[0]
-    grid, store = first_field(capture, box, level.voxel_size, opacity, 1)
+    plan = [replace(plan_levels(capture, box, 0.06, 1)[0], iterations=iterations)]
     settings = FitSettings.of(opacity=opacity)
-    march = March(
-        ops.OPACITY[opacity], SLOPE, settings.descent.step * level.voxel_size, settings.descent.stop
+    studio = open_studio(capture, settings, 0)
+    stage = begin_stage(
+        settings, plan, 0, *first_field(capture, box, plan[0].voxel_size, settings, 1), studio
     )
-    rays = gather_rays(capture, store, grid, opacity, march, choose_backdrop(capture))
-    generator = torch.Generator().manual_seed(0)
-    seconds: dict[str, float] = {}
-    rows = list(descend(store, grid, rays, settings, march, iterations, generator, seconds))
-    assert set(seconds) >= {"march", "voxels", "adam"}
-    return store, rows
+    rows = list(descend(stage, studio, settings))
+    assert set(stage.seconds) >= {"march", "voxels", "adam"}
+    return stage.store, rows
 
 
 @pytest.mark.parametrize("opacity", ["transparency", "distance"])

@@ -15,6 +15,7 @@ from torch_surfcap.field.field import CLAMP, ETA, SLOPE
 from torch_surfcap.field.tiles import TileGrid, voxel_centers
 from torch_surfcap.fitting.levels import FOG, ITERATIONS, first_field, next_level, plan_levels, subject_box
 from torch_surfcap.fitting.rays import RayBatch, gather_rays
+from torch_surfcap.fitting.settings import FitSettings
 
 center = torch.tensor(CENTER, dtype=torch.float64)
 BOX = (center - 0.35, center + 0.35)
@@ -55,7 +56,7 @@ def test_box_as_given() -> None:
 def test_first_field_holds_the_ball(opacity: str, degree: int) -> None:
     """Its surface lies outside the ball, by little more than the pixel and the voxel that the hull is widened by."""
     capture, voxel = ball(), 0.03
-    grid, store = first_field(capture, BOX, voxel, opacity, degree)
+    grid, store = first_field(capture, BOX, voxel, FitSettings.of(opacity=opacity), degree)
     assert store.shape == (len(grid.coords), 4, 4, 4, ops.pitch(degree))
     field = SurfaceField(store, grid, opacity)
     radius = (voxel_centers(grid) - center).norm(dim=-1)
@@ -80,13 +81,13 @@ def test_a_box_of_too_many_voxels() -> None:
     with pytest.raises(
         InputError, match=r"memory: the first level \(voxels of 1e-07\) needs .* GiB are free"
     ):
-        first_field(ball(6, 16), BOX, 1e-7, "distance", 0)
+        first_field(ball(6, 16), BOX, 1e-7, FitSettings.of(opacity="distance"), 0)
 
 
 def test_nothing_in_the_box() -> None:
     far = (center + 5, center + 6)
     with pytest.raises(InputError, match="silhouettes: the visual hull is empty inside the box"):
-        first_field(ball(6, 16), far, 0.1, "distance", 0)
+        first_field(ball(6, 16), far, 0.1, FitSettings.of(opacity="distance"), 0)
 
 
 def plane() -> tuple[TileGrid, Tensor, Tensor, float]:
@@ -104,13 +105,15 @@ def plane() -> tuple[TileGrid, Tensor, Tensor, float]:
 def no_rays() -> RayBatch:
     empty, three = torch.zeros(0, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     ranges = (torch.zeros(1, dtype=torch.int64), torch.zeros(0, 2, dtype=torch.float64))
-    return RayBatch(three, three, three, three, empty, empty, ranges, [0])
+    return RayBatch(three, three, three, three, empty, empty, ranges, [0], empty.int())
 
 
 def test_next_level_of_a_distance() -> None:
     """Half the voxel, so twice the distance in voxels; tiles along the surface only, solid ones behind it."""
     grid, store, normal, offset = plane()
-    fine, values = next_level(grid, store, "distance", no_rays(), March(1, SLOPE, 1.0, 0.0))
+    fine, values = next_level(
+        grid, store, FitSettings.of(opacity="distance"), no_rays(), March(1, SLOPE, 1.0, 0.0)
+    )
     assert fine.voxel_size == 0.1
     assert fine.size == tuple(2 * n for n in grid.size)
     assert len(fine.coords) < 8 * len(grid.coords)
@@ -136,7 +139,9 @@ def test_next_level_of_a_steep_distance() -> None:
     """No hole where the distance leaps from one side to the other between two voxels, stored or missing."""
     grid, store, normal, offset = plane()
     store[..., 0] = torch.where(store[..., 0] < 0, -CLAMP, CLAMP)
-    fine, _ = next_level(grid, store, "distance", no_rays(), March(1, SLOPE, 1.0, 0.0))
+    fine, _ = next_level(
+        grid, store, FitSettings.of(opacity="distance"), no_rays(), March(1, SLOPE, 1.0, 0.0)
+    )
     at = torch.tensor([[i, j, k] for i in range(32) for j in range(32) for k in range(32)])
     away = (at + 0.5).double() * 0.2 @ normal - offset
     surface = ((at > 0) & (at < 31)).all(1) & (
@@ -149,7 +154,9 @@ def test_next_level_of_a_steep_distance() -> None:
 def test_first_field_has_no_phantoms() -> None:
     """In the margin and the last tiles around the box few cameras look: nothing may start there."""
     capture, voxel = ball(side=48), 1 / 24
-    grid, store = first_field(capture, subject_box(capture, None), voxel, "transparency", 0)
+    grid, store = first_field(
+        capture, subject_box(capture, None), voxel, FitSettings.of(opacity="transparency"), 0
+    )
     reach = ((voxel_centers(grid) - center).norm(dim=-1) - RADIUS)[store[..., 0] < 0.99]
     assert reach.max() < 4 * voxel
 
@@ -158,8 +165,8 @@ def test_next_level_leaves_empty_space_empty() -> None:
     """Transparent voxels beside the ball that no ray happens to read are not solid."""
     grid, store = fog_around_ball()
     march = March(0, SLOPE, 0.04, 1e-3)
-    rays = gather_rays(ball(side=32), store, grid, "transparency", march, torch.zeros(3))
-    fine, _ = next_level(grid, store, "transparency", rays, march)
+    rays = gather_rays(ball(side=32), store, grid, "transparency", march)
+    fine, _ = next_level(grid, store, FitSettings.of(opacity="transparency"), rays, march)
     inside = (fine.inside.nonzero().double() + 0.5) * 4 * fine.voxel_size + torch.tensor(fine.origin)
     assert len(inside) > 0
     assert ((inside - center).norm(dim=1) < RADIUS).all()
@@ -183,12 +190,14 @@ def fog_around_ball() -> tuple[TileGrid, Tensor]:
 def test_next_level_of_a_transparency() -> None:
     """Tiles where samples have weight; what no light reaches is solid, what it passes is dropped."""
     capture, voxel = ball(side=32), 0.04
-    grid, store = first_field(capture, (center - 0.3, center + 0.3), voxel, "transparency", 0)
+    grid, store = first_field(
+        capture, (center - 0.3, center + 0.3), voxel, FitSettings.of(opacity="transparency"), 0
+    )
     radius = (voxel_centers(grid) - center).norm(dim=-1)
     store[..., 0] = torch.where(radius < RADIUS, ETA, 1.0)
     march = March(0, SLOPE, voxel, 1e-3)
-    rays = gather_rays(capture, store, grid, "transparency", march, torch.zeros(3))
-    fine, values = next_level(grid, store, "transparency", rays, march)
+    rays = gather_rays(capture, store, grid, "transparency", march)
+    fine, values = next_level(grid, store, FitSettings.of(opacity="transparency"), rays, march)
     assert fine.voxel_size == voxel / 2
     assert values.shape == (len(fine.coords), 4, 4, 4, 4)
     away = (voxel_centers(fine) - center).norm(dim=-1) - RADIUS

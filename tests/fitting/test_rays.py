@@ -11,8 +11,10 @@ from torch_surfcap import Capture, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.field.field import MISSING, SLOPE
 from torch_surfcap.field.tiles import TileGrid, voxel_centers
+from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.levels import first_field
-from torch_surfcap.fitting.rays import BLOCK, choose_backdrop, find_ranges, gather_rays
+from torch_surfcap.fitting.rays import BLOCK, RayBatch, choose_backdrop, find_ranges, gather_rays
+from torch_surfcap.fitting.settings import FitSettings
 
 center = torch.tensor(CENTER, dtype=torch.float64)
 BOX = (center - 0.35, center + 0.35)
@@ -22,7 +24,7 @@ OPACITIES = ("transparency", "distance")
 
 def fitted(opacity: str, capture: Capture) -> tuple[TileGrid, Tensor, March]:
     """A field that holds the ball as a fit would leave it, with noise in its colours."""
-    grid, store = first_field(capture, BOX, VOXEL, opacity, 1)
+    grid, store = first_field(capture, BOX, VOXEL, FitSettings.of(opacity=opacity), 1)
     g = torch.Generator().manual_seed(0)
     away = ((voxel_centers(grid) - center).norm(dim=-1) - RADIUS) / VOXEL
     store[..., 0] = (away.clamp(-4, 4) if opacity == "distance" else 0.81 + 0.3 * away).clamp(
@@ -32,12 +34,21 @@ def fitted(opacity: str, capture: Capture) -> tuple[TileGrid, Tensor, March]:
     return grid, store, March(ops.OPACITY[opacity], SLOPE, 3**0.5 * VOXEL, 1e-3)
 
 
+def exposed(
+    capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March, backdrop: Tensor | None
+) -> RayBatch:
+    """The rays with the colours of the pictures as they are."""
+    rays = gather_rays(capture, store, grid, opacity, march)
+    rays.expose(capture, backdrop, Exposure.equal(len(capture)))
+    return rays
+
+
 @pytest.mark.parametrize("opacity", OPACITIES)
 def test_every_ray_that_meets_the_surface_is_there(opacity: str) -> None:
     """What meets the ball is kept and stands for its own pixel; what passes far from it is culled."""
     capture = ball()
     grid, store, march = fitted(opacity, capture)
-    rays = gather_rays(capture, store, grid, opacity, march, torch.zeros(3))
+    rays = exposed(capture, store, grid, opacity, march, torch.zeros(3))
     assert len(rays.camera_starts) == len(capture) + 1
     assert rays.camera_starts[-1] == len(rays)
     assert len(rays) < 0.8 * 12 * 64 * 64
@@ -66,7 +77,7 @@ def test_weights_do_not_depend_on_cameras_pixels_or_voxels() -> None:
     """A ray's weight is 1/(views * pixels of a voxel's face), so their sum over a face's pixels and views is 1."""
     capture = photographed(ring(4, side=[32, 64, 64, 48]))
     grid, store, march = fitted("distance", capture)
-    rays = gather_rays(capture, store, grid, "distance", march, torch.zeros(3))
+    rays = exposed(capture, store, grid, "distance", march, torch.zeros(3))
     middle = torch.tensor(grid.origin) + torch.tensor(grid.size) * 2 * VOXEL
     for i, side in enumerate((32, 64, 64, 48)):
         distance = float((capture.cameras.centers[i] - middle).norm())
@@ -81,7 +92,7 @@ def test_what_rays_should_see() -> None:
     for plates in (False, True):
         capture = ball(6, 48, plates)
         grid, store, march = fitted("distance", capture)
-        rays = gather_rays(capture, store, grid, "distance", march, None if plates else backdrop)
+        rays = exposed(capture, store, grid, "distance", march, None if plates else backdrop)
         uv, _ = capture.cameras.project(0, (rays.origins + rays.directions).double()[: rays.camera_starts[1]])
         column, row = (uv - 0.5).round().long().unbind(1)
         photograph, mask = capture.photograph(0)[row, column], rays.mask[: rays.camera_starts[1], None]
@@ -101,7 +112,7 @@ def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
     """
     capture = ball()
     grid, store, march = fitted(opacity, capture)
-    rays = gather_rays(capture, store, grid, opacity, march, torch.zeros(3))
+    rays = exposed(capture, store, grid, opacity, march, torch.zeros(3))
     again = find_ranges(store, grid, opacity, march, rays.origins, rays.directions)
     assert torch.equal(again[0], rays.ranges[0])
     assert torch.equal(again[1], rays.ranges[1])
@@ -130,9 +141,9 @@ def test_rays_beside_the_surface_are_kept(opacity: str) -> None:
     """Where the field may still grow, the rays that would object are there: what counts is the tiles, not their values."""
     capture = ball(6, 32)
     grid, store, march = fitted(opacity, capture)
-    now = gather_rays(capture, store, grid, opacity, march, torch.zeros(3))
+    now = exposed(capture, store, grid, opacity, march, torch.zeros(3))
     store[..., 0] = 0.5
-    assert len(now) == len(gather_rays(capture, store, grid, opacity, march, torch.zeros(3)))
+    assert len(now) == len(exposed(capture, store, grid, opacity, march, torch.zeros(3)))
 
 
 def painted(color: list[float], source: str) -> Capture:
@@ -163,7 +174,7 @@ def test_no_rays_where_nothing_is() -> None:
     grid, store, march = fitted("distance", capture)
     none = torch.zeros(grid.size, dtype=torch.bool)
     empty = TileGrid.build(none, none, grid.origin, grid.voxel_size)
-    rays = gather_rays(capture, store[:0], empty, "distance", march, torch.zeros(3))
+    rays = exposed(capture, store[:0], empty, "distance", march, torch.zeros(3))
     assert len(rays) == 0
     assert rays.camera_starts == [0, 0, 0, 0]
     assert rays.ranges[0].tolist() == [0]

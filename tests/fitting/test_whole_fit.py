@@ -15,6 +15,7 @@ from torch_surfcap import FitResult, InputError, fit
 from torch_surfcap.fitting import fit as fit_function
 from torch_surfcap.fitting.budget import estimate, shortage
 from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
+from torch_surfcap.fitting.settings import FitSettings
 
 QUICK: dict[str, Any] = {"levels": 2, "voxel": 1 / 40}
 
@@ -112,7 +113,9 @@ def test_budget_grows_with_levels_and_degree() -> None:
     plan = plan_levels(capture, box, 0.05, 3)
     bytes_by_degree = []
     for degree in (0, 1, 2):
-        grid, store = first_field(capture, box, plan[0].voxel_size, "distance", degree)
+        grid, store = first_field(
+            capture, box, plan[0].voxel_size, FitSettings.of(opacity="distance"), degree
+        )
         budget = estimate(capture, plan, grid, store, "distance")
         assert budget.level_bytes == sorted(budget.level_bytes)
         assert budget.level_bytes[0] > 4 * 3 * store.numel()

@@ -134,7 +134,7 @@ def raw(name: str, arguments: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
         given = (*given[:7], 0.9, 0.99, 1e-8, given[7])
     if name == "photometric_step":
         voxels, groups = given[0], given[-1]
-        given = (*given[:10], None, None, *given[10:-1], voxels.new_empty(groups, *voxels.shape))
+        given = (*given[:10], None, None, *given[10:-1], False, voxels.new_empty(groups, *voxels.shape))
     return getattr(torch.ops.torch_surfcap, name).default, given
 
 

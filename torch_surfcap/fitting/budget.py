@@ -12,11 +12,12 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.tiles import TileGrid
-from torch_surfcap.fitting.descent import gradient_groups
 
 if TYPE_CHECKING:
     from torch_surfcap.fitting.levels import Level
 
+GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
+GROUPS = (4, 32)  # fewest, most
 BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
 SURFACE = {"transparency": 0.99, "distance": 0.0}  # opacity value on the hull's surface, where a fit starts
 AREA_PER_BORDER = 0.6  # voxel faces of area per voxel at the border of a ball, counted
@@ -49,6 +50,11 @@ def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor,
         level_bytes.append(int(4 * numbers * (3 + gradient_groups(numbers)) + BYTES_PER_RAY * rays))
         samples += rays * level.iterations * SAMPLES_PER_RAY
     return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
+
+
+def gradient_groups(numbers: int) -> int:
+    """How many partial gradients a field of so many numbers gets: as many as fit a fixed memory, whatever the threads."""
+    return max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
 
 
 LESS = "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"

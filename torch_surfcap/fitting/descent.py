@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
 
 from torch_surfcap import ops
-from torch_surfcap.autograd import March
 from torch_surfcap.field.field import MISSING
-from torch_surfcap.field.tiles import TileGrid
-from torch_surfcap.fitting.adam import TileAdam
-from torch_surfcap.fitting.rays import RayBatch, find_ranges
+from torch_surfcap.fitting.budget import gradient_groups
+from torch_surfcap.fitting.rays import find_ranges
 from torch_surfcap.fitting.settings import FitSettings
+from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio
 
 REFRESH = 8.0  # iterations at full rate after which the integration ranges are found anew: less than a voxel of motion
-GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
-GROUPS = (4, 32)  # fewest, most
 PARSIMONY_HUBER = 0.1
 BEND = (
     0.4  # voxels^-1, the sum of curvatures above which bending costs linearly: edges and thin parts survive
@@ -28,126 +21,60 @@ BEND = (
 
 RAY_LOSSES = ("photo", "sample", "mask")
 VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
+BALLOONING = VOXEL_LOSSES.index("ballooning")
+GAINS_EVERY = 5  # iterations between two fits of the cameras' gains
+FIRST_GAINS = 10  # iterations before the first: until then the field is grey and says nothing
 
 
-@dataclass
-class Plateau:
-    """When to lower the rates and when to end a level.
-
-    Each time the loss fell, over ``window`` iterations, by no more than ``gain`` of itself and no more than ``share`` of
-    its way since the top (photographs leave a rest that no field explains), the rates fall by ``factor``; the last of
-    ``drops`` times ends the level, as do ``limit`` iterations. The top is where the loss was highest in the first two
-    windows: after a change of level Adam's first steps overshoot.
-
-    >>> rule = Plateau(limit=100)
-    >>> sum(rule.goes_on(1.0) for _ in range(100))
-    11
-    """
-
-    limit: int
-    gain: float = 0.02
-    share: float = 0.03
-    window: int = 5
-    factor: float = 0.3
-    drops: int = 2
-    scale: float = 1.0
-    count: int = 0
-    top: float = -math.inf
-    losses: list[float] = field(default_factory=list)
-
-    def goes_on(self, loss: float) -> bool:
-        """Takes the loss of an iteration; whether another one follows."""
-        self.count += 1
-        if loss > self.top and self.count <= 2 * self.window:
-            self.top = loss
-            self.losses.clear()
-        self.losses.append(loss)
-        if len(self.losses) > self.window:
-            least = max(0.0, min(self.gain * loss, self.share * (self.top - loss)))
-            if self.losses[-1 - self.window] - loss <= least:
-                self.drops -= 1
-                self.scale *= self.factor
-                self.losses.clear()
-        return self.drops > 0 and self.count < self.limit
-
-
-def gradient_groups(numbers: int) -> int:
-    """How many partial gradients a field of so many numbers gets: as many as fit a fixed memory, whatever the threads."""
-    return max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
-
-
-def descend(
-    store: Tensor,
-    grid: TileGrid,
-    rays: RayBatch,
-    settings: FitSettings,
-    march: March,
-    iterations: int,
-    generator: torch.Generator,
-    seconds: dict[str, float],
-) -> Iterator[dict[str, float]]:
-    """Fits ``store`` in place and yields a row of losses (each unweighted, and their weighted sum) per iteration.
-
-    Args:
-        iterations: what such a level usually takes; three times as many are the limit.
-        generator: of the lattices' shifts. seconds: receives the time spent per stage.
-    """
+def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dict[str, float]]:
+    """Fits ``stage.store`` in place until the level ends, and yields a row of losses (each unweighted, and their weighted
+    sum) per iteration. Between two rows, all that the next one depends on lies in ``stage`` and ``studio``."""
     loss = settings.losses
     ray_weights, voxel_weights = (
         [getattr(loss, name) for name in names] for names in (RAY_LOSSES, VOXEL_LOSSES)
     )
-    weights = torch.tensor([*ray_weights, *voxel_weights], dtype=torch.float64)
+    store, grid, rays, rule = stage.store, stage.grid, stage.rays, stage.rule
     frame = grid.frame(*MISSING[settings.opacity])
     bundle = (rays.origins, rays.directions)
     seen = (rays.background, rays.target, rays.mask, rays.weight)
     gradients = store.new_empty(gradient_groups(store.numel()), *store.shape)
-    adam = TileAdam(store, settings.opacity, settings.descent)
-    rule = Plateau(limit=3 * iterations)
-    watch = Stopwatch(seconds)
-    goes_on, moved = True, 0.0
-    while goes_on:
-        if moved >= REFRESH:
-            moved = 0.0
-            rays.ranges = find_ranges(store, grid, settings.opacity, march, *bundle)
+    watch = Stopwatch(stage.seconds)
+    while not rule.ended:
+        if stage.moved >= REFRESH:
+            stage.moved = 0.0
+            rays.ranges = find_ranges(store, grid, settings.opacity, stage.march, *bundle)
             watch.lap("ranges")
-        shift = (torch.rand(len(rays), generator=generator) - 0.5) * settings.descent.jitter
-        ray_losses, gradient, _, _ = ops.photometric_step(
+        shift = (torch.rand(len(rays), generator=studio.generator) - 0.5) * settings.descent.jitter
+        ray_losses, gradient, color, transmittance = ops.photometric_step(
             store,
             grid.table,
             frame,
             *bundle,
             shift,
             *seen,
-            **march._asdict(),
+            **stage.march._asdict(),
             huber=loss.huber,
             weights=ray_weights,
             detach_sample=loss.detach_sample,
+            rendered_sample=loss.sample_target == "rendered",
             ranges=rays.ranges,
             gradients=gradients,
         )
         watch.lap("march")
+        if loss.anneal:  # the bias helps to find a surface, and then stands in its way
+            voxel_weights[BALLOONING] = loss.ballooning * rule.scale
         voxel_losses = ops.voxel_terms(
             store, grid.table, frame, grid.places, voxel_weights, PARSIMONY_HUBER, BEND, gradient
         )
         watch.lap("voxels")
-        adam.step(gradient, rule.scale)
-        moved += rule.scale
+        stage.adam.step(gradient, rule.scale)
+        stage.moved += rule.scale
         watch.lap("adam")
+        if studio.gains and (stage.number > 0 or rule.count >= FIRST_GAINS) and rule.count % GAINS_EVERY == 0:
+            studio.fit_exposure(stage, color, transmittance)
+            watch.lap("gains")
         losses = torch.cat([ray_losses, voxel_losses])
-        total = float(losses @ weights)
-        row = {"iteration": float(rule.count), "loss": total, "rate": rule.scale}
-        goes_on = rule.goes_on(total)
+        weights = losses.new_tensor([*ray_weights, *voxel_weights])
+        row = {"iteration": float(rule.count), "loss": float(losses @ weights), "rate": rule.scale}
+        rule.goes_on(row["loss"])
         yield row | dict(zip(RAY_LOSSES + VOXEL_LOSSES, losses.tolist(), strict=True))
-
-
-class Stopwatch:
-    """Adds up seconds by stage."""
-
-    def __init__(self, seconds: dict[str, float]) -> None:
-        self.seconds = seconds
-        self.last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now

@@ -6,20 +6,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
 from torch_surfcap import ops
-from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import prepare
 from torch_surfcap.errors import InputError
-from torch_surfcap.field.field import SLOPE, SurfaceField
+from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.fitting.budget import Budget, estimate, shortage
-from torch_surfcap.fitting.descent import Stopwatch, descend
-from torch_surfcap.fitting.levels import Level, first_field, next_level, plan_levels, subject_box
-from torch_surfcap.fitting.rays import choose_backdrop, gather_rays
+from torch_surfcap.fitting.checkpoint import Checkpoints, Record
+from torch_surfcap.fitting.descent import descend
+from torch_surfcap.fitting.levels import Level, first_field, plan_levels, subject_box
 from torch_surfcap.fitting.settings import FitSettings
+from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio, begin_stage, next_stage, open_studio
 
 if TYPE_CHECKING:
     import trimesh
@@ -32,7 +31,8 @@ class FitResult:
     """What a fit gives.
 
     field, mesh: the surface. history: one row per iteration, with its level. gain, bias: [N, 3] per camera.
-    chosen: what the program chose and why. seconds: per stage and level. warnings: one sentence each.
+    chosen: what the program chose and why. seconds: per stage and level. warnings: one sentence each. resumed_from:
+    [level, iteration] of the checkpoint that the fit began with, None without one. iterations_run: since then.
     """
 
     field: SurfaceField
@@ -43,6 +43,8 @@ class FitResult:
     chosen: dict[str, Any]
     seconds: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    resumed_from: list[int] | None = None
+    iterations_run: int = 0
 
 
 @dataclass(frozen=True)
@@ -58,16 +60,23 @@ class Progress:
     budget: Budget | None = None
 
 
-def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **settings: Any) -> FitResult:
+def fit(
+    capture: Capture,
+    progress: Callable[[Progress], None] | None = None,
+    checkpoints: Checkpoints | None = None,
+    **settings: Any,
+) -> FitResult:
     """Fit a field to the photographs of a capture and take its mesh.
 
     Args:
         capture: its training views; held-out views are never looked at.
         progress: called before the first level and after every iteration.
+        checkpoints: where the fit leaves them, and whether it begins with one.
         settings: see :class:`torch_surfcap.fitting.settings.FitSettings`.
 
     Raises:
-        InputError: no silhouettes, no common view volume, an empty hull, no memory for even the first level.
+        InputError: no silhouettes, no common view volume, an empty hull, no memory for even the first level, a
+            checkpoint of another fit.
         TypeError, ValueError: unknown or impossible settings.
 
     >>> import torch_surfcap as sc
@@ -81,65 +90,96 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
     seconds: dict[str, Any] = {}
     watch = Stopwatch(seconds)
     capture = prepare(capture)
+    saved = None if checkpoints is None else checkpoints.load()
+    if saved is not None and checkpoints is not None:
+        checkpoints.check(saved, s, capture)
     degree = DEFAULT_DEGREE if s.sh_degree is None else s.sh_degree
-    box = subject_box(capture, s.box)
+    box = subject_box(capture, s.box) if saved is None else saved.box
     plan = plan_levels(capture, box, s.voxel, s.levels)
-    pictures = [capture]
-    while len(pictures) <= plan[0].halvings:
-        pictures.append(pictures[-1].halved())
-    backdrop = choose_backdrop(capture)
-    grid, store = first_field(pictures[plan[0].halvings], box, plan[0].voxel_size, s.opacity, degree)
-    watch.lap("hull")
-    budget = estimate(capture, plan, grid, store, s.opacity)
-    report(Progress(0, len(plan), plan[0], 0, {}, budget))
-
-    history: list[dict[str, float]] = []
-    warnings = list(capture.warnings)
-    by_level: list[dict[str, float]] = []
-    generator = torch.Generator().manual_seed(s.seed)
-    rays, march = None, None
-    for number, level in enumerate(plan):
-        missing = shortage(budget.level_bytes[number])
+    studio = open_studio(capture, s, plan[0].halvings)
+    so_far = Record(list(capture.warnings))
+    if saved is None:
+        grid, store = first_field(studio.pictures[-1], box, plan[0].voxel_size, s, degree)
+        watch.lap("hull")
+        budget = estimate(capture, plan, grid, store, s.opacity)
+        so_far.level_bytes = budget.level_bytes
+        report(Progress(0, len(plan), plan[0], 0, {}, budget))
+        missing = short_of(plan, 0, so_far.level_bytes)
         if missing:
-            sentence = f"level {number + 1} of {len(plan)} (voxels of {level.voxel_size:.4g}) {missing}"
-            if number == 0:
-                raise InputError(f"memory: {sentence}")
-            warnings.append(f"{sentence}; the fit ends with the level before")
+            raise InputError(f"memory: {missing}")
+        stage = begin_stage(s, plan, 0, grid, store, studio)
+    else:
+        stage, so_far = saved.stage(s, plan, studio), Record(**saved.plain["record"])
+        watch.lap("resume")
+    resumed = len(so_far.history)
+
+    while True:
+        for row in descend(stage, studio, s):
+            so_far.history.append({"level": float(stage.number)} | row)
+            report(Progress(stage.number, len(plan), stage.level, len(stage.store) * ops.TILE**3, row))
+            if checkpoints is not None and checkpoints.due():
+                checkpoints.save(s, capture, box, stage, studio, so_far)
+        so_far.seconds.append(stage.seconds)
+        if stage.number == len(plan) - 1:
             break
-        spent: dict[str, float] = {}
-        level_watch = Stopwatch(spent)
-        if rays is not None and march is not None:
-            grid, store = next_level(grid, store, s.opacity, rays, march)
-        step = s.descent.last_step if number == len(plan) - 1 else s.descent.step
-        march = March(ops.OPACITY[s.opacity], SLOPE, step * level.voxel_size, s.descent.stop)
-        rays = gather_rays(pictures[level.halvings], store, grid, s.opacity, march, backdrop)
-        level_watch.lap("prepare")
-        for row in descend(store, grid, rays, s, march, level.iterations, generator, spent):
-            history.append({"level": float(number)} | row)
-            report(Progress(number, len(plan), level, len(store) * ops.TILE**3, row))
-        by_level.append(spent)
+        missing = short_of(plan, stage.number + 1, so_far.level_bytes)
+        if missing:
+            so_far.warnings.append(f"{missing}; the fit ends with the level before")
+            break
+        stage = next_stage(stage, s, plan, studio)
+        if checkpoints is not None:
+            checkpoints.save(s, capture, box, stage, studio, so_far)
     watch.lap("fit")
-    surface = SurfaceField(store, grid, s.opacity)
+    surface = SurfaceField(stage.store, stage.grid, s.opacity)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:
         raise InputError("surface: the fit ended without any, expected a subject inside the silhouettes")
-    seconds["levels"] = by_level
-    identity = torch.ones(len(capture), 3)
-    cut = "memory" if len(by_level) < len(plan) else None
-    chosen = {
+    seconds["levels"] = so_far.seconds
+    return FitResult(
+        surface,
+        mesh,
+        so_far.history,
+        studio.exposure.gain,
+        studio.exposure.bias,
+        _chosen(s, degree, box, stage, plan, studio),
+        seconds,
+        so_far.warnings,
+        None if saved is None else saved.place,
+        len(so_far.history) - resumed,
+    )
+
+
+def short_of(plan: list[Level], number: int, level_bytes: list[int]) -> str | None:
+    """What a level lacks, None where there is memory for it."""
+    missing = shortage(level_bytes[number])
+    return (
+        missing and f"level {number + 1} of {len(plan)} (voxels of {plan[number].voxel_size:.4g}) {missing}"
+    )
+
+
+def _chosen(
+    s: FitSettings, degree: int, box: tuple[Tensor, Tensor], stage: Stage, plan: list[Level], studio: Studio
+) -> dict[str, Any]:
+    """What the fit chose, and why."""
+    cut = "memory" if stage.number < len(plan) - 1 else None
+    return {
         "sh_degree": {"value": degree, "reason": "default" if s.sh_degree is None else "given"},
         "voxel": {
-            "value": surface.voxel_size,
+            "value": stage.grid.voxel_size,
             "reason": cut or ("a pixel's footprint" if s.voxel is None else "given"),
         },
         "levels": {
-            "value": len(by_level),
+            "value": stage.number + 1,
             "reason": cut or ("size of the pictures" if s.levels is None else "given"),
         },
         "box": {
             "value": [*box[0].tolist(), *box[1].tolist()],
             "reason": "silhouettes" if s.box is None else "given",
         },
+        "gains": {
+            "value": "on" if studio.gains else "off",
+            "spread": studio.spread,
+            "reason": "found at the coarsest level" if s.gains == "auto" else "given",
+        },
     }
-    return FitResult(surface, mesh, history, identity, torch.zeros_like(identity), chosen, seconds, warnings)

@@ -18,12 +18,14 @@ from torch_surfcap.field.hull import Silhouettes, find_box, pixel_footprint
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.budget import shortage
 from torch_surfcap.fitting.rays import QUIET, RayBatch
+from torch_surfcap.fitting.settings import FitSettings
 
 ITERATIONS = (60, 40, 30, 20)  # from the fourth-finest level to the finest: a scale, not a limit
 SMALLEST_IMAGE = 32  # pixels along the shorter side of the coarsest pictures
 MARGIN = 2  # coarse voxels around the subject's box
 DENSE_BYTES = 100  # per voxel of the box, while the first field is made: points, hull and distances
 FOG = 0.98  # transparency that the hull is filled with
+DEEP = 12.0  # voxels below the hull's surface where a start that falls off ends
 BAND = (
     0.5  # voxels on either side of a signed distance's zero that the next level follows, with a margin of one
 )
@@ -70,13 +72,15 @@ def subject_box(capture: Capture, box: tuple[float, ...] | None) -> tuple[Tensor
 
 
 def first_field(
-    capture: Capture, box: tuple[Tensor, Tensor], voxel_size: float, opacity: str, sh_degree: int
+    capture: Capture, box: tuple[Tensor, Tensor], voxel_size: float, settings: FitSettings, sh_degree: int
 ) -> tuple[TileGrid, Tensor]:
     """Grid and padded records [T, 4, 4, 4, P] of the coarsest level, out of the soft hull.
 
     The hull of masks grown by a pixel is widened by a voxel, so that no thin part is lost on the coarse grid. A signed
-    distance starts as the distance to it, a transparency as thin fog inside it; both grey.
+    distance starts as the distance to it, a transparency as thin fog inside it, or, where ``settings.start`` is "hull",
+    falling off from its surface; all grey.
     """
+    opacity = settings.opacity
     low, high = box
     edge = ops.TILE * voxel_size
     corner = low - MARGIN * voxel_size
@@ -98,6 +102,8 @@ def first_field(
         stored, deep = _tilewise(distance < 2.0), ~_tilewise(distance > -CLAMP)
     else:
         value = torch.where(distance < 0, FOG, MISSING[opacity][0])
+        if settings.start == "hull":
+            value = 1 - (1 - FOG) * (1 - distance).clamp(0, DEEP)
         stored, deep = _tilewise(distance < 1.0), torch.zeros(size, dtype=torch.bool)
     grid = TileGrid.build(stored & ~deep, deep, (x, y, z), voxel_size)
     tiles = value.reshape(size[0], 4, size[1], 4, size[2], 4).permute(0, 2, 4, 1, 3, 5)
@@ -115,13 +121,14 @@ def _tilewise(voxels: Tensor) -> Tensor:
 
 
 def next_level(
-    grid: TileGrid, store: Tensor, opacity: str, rays: RayBatch, march: March
+    grid: TileGrid, store: Tensor, settings: FitSettings, rays: RayBatch, march: March
 ) -> tuple[TileGrid, Tensor]:
     """Grid and records at half the voxel size; ``rays`` and ``march`` are those of the level that is done.
 
     A signed distance knows where its surface is. A transparency does not: its surface is where samples have weight,
     and what no camera's light reaches is solid (paper, section 4.2), unless it is as good as empty: no ray came by.
     """
+    opacity = settings.opacity
     outside, inside = MISSING[opacity]
     frame = grid.frame(outside, inside)
     if opacity == "distance":
@@ -137,4 +144,6 @@ def next_level(
     values = ops.upscale(store, grid.table, frame, fine.places, fine.frame(outside, inside))
     if opacity == "distance":
         values[..., 0].mul_(2.0).clamp_(-CLAMP, CLAMP)
+    elif settings.upscale == "sqrt":
+        values[..., 0].sqrt_()
     return fine, values

@@ -10,13 +10,16 @@ from torch import Tensor
 
 from torch_surfcap import ops
 from torch_surfcap.autograd import March
+from torch_surfcap.data.arrays import float_tensor
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.field.hull import grown
 from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.color_gain import Equations, Exposure
 
 BLOCK = 8  # rays are ordered in blocks of so many pixels a side, so that neighbours read the same tiles
 QUIET = {"transparency": 0.999, "distance": 1.5}  # opacity value above which space is as good as empty
+WITHIN = 0.99  # a mask above which a pixel shows the subject alone
 MARGIN = 4  # voxels beyond the silhouette that rays are followed
 
 
@@ -25,7 +28,7 @@ class RayBatch:
     """R rays and their observations, float32, in the order of cameras and pixel blocks.
 
     origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them;
-    camera_starts: [N + 1], where each camera's rays begin.
+    camera_starts: [N + 1], where each camera's rays begin; pixels: [R] int32, row-major number in the camera's picture.
     """
 
     origins: Tensor
@@ -36,38 +39,74 @@ class RayBatch:
     weight: Tensor
     ranges: tuple[Tensor, Tensor]
     camera_starts: list[int]
+    pixels: Tensor
 
     def __len__(self) -> int:
         return len(self.mask)
 
+    def of_camera(self, i: int) -> slice:
+        """Which rays are camera i's."""
+        return slice(self.camera_starts[i], self.camera_starts[i + 1])
 
-def gather_rays(
-    capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March, backdrop: Tensor | None
-) -> RayBatch:
-    """The rays of all cameras that meet anything in the field (the others are culled).
+    def expose(self, capture: Capture, backdrop: Tensor | None, exposure: Exposure) -> None:
+        """Sets target and background in the common exposure.
+
+        Args:
+            backdrop: [3], the colour over which the photographs are composited with their masks; None: the plates are
+                the background and the photographs stay as they are.
+        """
+        for i in range(len(capture)):
+            part = self.of_camera(i)
+            photograph = exposure.common(i, picture_at(capture.images[i], self.pixels[part]))
+            if backdrop is None:
+                assert capture.plates is not None
+                self.background[part] = exposure.common(i, picture_at(capture.plates[i], self.pixels[part]))
+                self.target[part] = photograph
+            else:
+                soft = self.mask[part, None]
+                self.background[part] = backdrop
+                self.target[part] = soft * photograph + (1 - soft) * backdrop
+
+    def equations(
+        self, capture: Capture, backdrop: Tensor | None, color: Tensor, transmittance: Tensor
+    ) -> Equations:
+        """What renderings of these rays, [R, 3] and [R], say about the cameras' gains."""
+        cameras = []
+        for i in range(len(capture)):
+            part = self.of_camera(i)
+            photograph = picture_at(capture.images[i], self.pixels[part])
+            through = transmittance[part]
+            if backdrop is None:
+                assert capture.plates is not None
+                field = color[part] - through[:, None] * self.background[part]
+                plate = picture_at(capture.plates[i], self.pixels[part])
+                cameras.append(Equations.of(photograph, field, through, plate))
+            else:
+                within = self.mask[part] > WITHIN
+                cameras.append(Equations.of(photograph[within], color[part][within]))
+        return Equations.joined(cameras)
+
+
+def picture_at(picture: Tensor, pixels: Tensor) -> Tensor:
+    """Colours [M, 3], float32 in [0, 1], of a picture [H, W, 3] at the row-major numbers [M] of pixels."""
+    return float_tensor(picture.reshape(-1, 3)[pixels.long()])
+
+
+def gather_rays(capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March) -> RayBatch:
+    """The rays of all cameras that meet anything in the field (the others are culled), still without colours.
 
     The weight of a ray is 1/(number of views * rho), rho = (voxel * focal / distance)^2 being the pixels that a voxel's
     face covers: the gradient on a voxel then depends neither on the number of cameras nor on the image size nor on the
     level.
-
-    Args:
-        backdrop: [3], the colour over which the photographs are composited with their masks; None: the plates are the
-            background and the photographs stay as they are.
     """
     assert capture.masks is not None
-    cameras = capture.cameras
-    low = torch.tensor(grid.origin, dtype=torch.float64)
-    center = low + torch.tensor(grid.size, dtype=torch.float64) * ops.TILE * grid.voxel_size / 2
-    distance = (cameras.centers - center).norm(dim=1)
-    focal = torch.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
-    pixels_per_voxel = grid.voxel_size * focal / distance
+    per_voxel = pixels_per_voxel(capture, grid)
     store = colorless(store)  # once, not anew for every camera
-    parts: list[tuple[Tensor, ...]] = []
-    starts, counts, ranges = [0], [], []
+    chosen, counts, ranges = [], [], []
     for i, mask in enumerate(capture.masks):
-        reach = int(torch.ceil(MARGIN * pixels_per_voxel[i])) + 1
+        reach = int(torch.ceil(MARGIN * per_voxel[i])) + 1
         index = _blocked((grown(mask, reach) > 0).nonzero())
-        origins, directions = (r.float().contiguous() for r in cameras.rays(i, index.flip(1).double() + 0.5))
+        origins, directions = _rays(capture, i, index)
         offsets, stretches = find_ranges(store, grid, opacity, march, origins, directions)
         passes = offsets.diff()
         hit = passes > 0
@@ -75,25 +114,45 @@ def gather_rays(
         rest = (~hit).nonzero()[:, 0]
         all_of_them, _ = find_ranges(store, grid, opacity, march, origins[rest], directions[rest], math.inf)
         hit[rest] = all_of_them.diff() > 0
-        index, origins, directions = index[hit], origins[hit], directions[hit]
-        v, u = index.unbind(1)
-        photograph, soft = capture.photograph(i)[v, u], mask[v, u]
-        if backdrop is None:
-            background = capture.plate(i)[v, u]
-        else:
-            background = backdrop.expand_as(photograph)
-            photograph = soft[:, None] * photograph + (1 - soft[:, None]) * background
-        weight = torch.full_like(soft, 1.0 / (len(cameras) * float(pixels_per_voxel[i]) ** 2))
-        parts.append((origins, directions, photograph, background, soft, weight))
+        chosen.append((index[hit, 0] * mask.shape[1] + index[hit, 1]).int())
         counts.append(passes[hit])
         ranges.append(stretches)
-        starts.append(starts[-1] + len(index))
-    joined = [torch.cat(column).contiguous() for column in zip(*parts, strict=True)]
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
-    origins, directions, target, background, soft, weight = joined
-    return RayBatch(
-        origins, directions, target, background, soft, weight, (offsets, torch.cat(ranges)), starts
-    )
+    return rays_of(capture, grid, chosen, (offsets, torch.cat(ranges)))
+
+
+def rays_of(
+    capture: Capture, grid: TileGrid, pixels: list[Tensor], ranges: tuple[Tensor, Tensor]
+) -> RayBatch:
+    """The rays through pixels, given per camera by their row-major numbers, still without colours."""
+    assert capture.masks is not None
+    per_voxel = pixels_per_voxel(capture, grid)
+    parts, starts = [], [0]
+    for i, (mask, chosen) in enumerate(zip(capture.masks, pixels, strict=True)):
+        width = mask.shape[1]
+        index = torch.stack([chosen.long() // width, chosen.long() % width], 1)
+        weight = torch.full((len(index),), 1.0 / (len(capture) * float(per_voxel[i]) ** 2))
+        parts.append((*_rays(capture, i, index), mask.flatten()[chosen.long()], weight))
+        starts.append(starts[-1] + len(index))
+    origins, directions, mask, weight = (torch.cat(c).contiguous() for c in zip(*parts, strict=True))
+    target, background = torch.empty_like(origins), torch.empty_like(origins)
+    return RayBatch(origins, directions, target, background, mask, weight, ranges, starts, torch.cat(pixels))
+
+
+def pixels_per_voxel(capture: Capture, grid: TileGrid) -> Tensor:
+    """[N] pixels that a voxel's edge covers in each camera's picture, at the middle of the grid."""
+    cameras = capture.cameras
+    low = torch.tensor(grid.origin, dtype=torch.float64)
+    center = low + torch.tensor(grid.size, dtype=torch.float64) * ops.TILE * grid.voxel_size / 2
+    distance = (cameras.centers - center).norm(dim=1)
+    focal = torch.sqrt(cameras.K[:, 0, 0] * cameras.K[:, 1, 1])
+    return grid.voxel_size * focal / distance
+
+
+def _rays(capture: Capture, i: int, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Origins and directions [M, 3], float32, through the centres of pixels [M, 2] (row, column)."""
+    origins, directions = capture.cameras.rays(i, index.flip(1).double() + 0.5)
+    return origins.float().contiguous(), directions.float().contiguous()
 
 
 def colorless(store: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -21,6 +22,8 @@ class Losses:
     ballooning: float = 0.0  # squared opacity value, eq. 12
     curvature: float = 1e-4  # Huber norm of the Laplacian of the opacity value
     detach_sample: bool = False  # the sample loss moves colours only
+    sample_target: str = "observed"  # or "rendered": the ray's colour that samples are held against
+    anneal: bool = False  # ballooning falls with the rates towards the end of a level
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,14 @@ DESCENT = {
     "transparency": Descent(rate_opacity=0.06),
 }
 
+CHOICES = {
+    "gains": ("auto", "on", "off"),
+    "gain_per": ("channel", "camera"),
+    "start": ("hull", "constant"),
+    "upscale": ("plain", "sqrt"),
+}
+SAMPLE_TARGETS = ("observed", "rendered")
+
 
 @dataclass(frozen=True)
 class FitSettings:
@@ -55,6 +66,11 @@ class FitSettings:
     voxel:     edge of the finest voxels, world units; a pixel's footprint by default
     levels:    number of resolutions; by default as many, up to 4, as the pictures can be halved
     box:       (x0, y0, z0, x1, y1, z1) around the subject; found by default
+    gains:     "auto", "on", "off": gain and bias per camera; auto takes them where the coarsest level finds any
+    gain_per:  "channel" or "camera", what has a gain and bias of its own
+    start:     "hull": the first field falls off at the hull's surface; "constant": a transparency is the same fog inside
+    upscale:   "plain" or "sqrt": a transparency at a change of level stays, or becomes its root, so that two fine voxels
+               stop as much light as the coarse one did
     threshold: opacity value of the surface. smooth: rounds of Taubin smoothing of the mesh. specks: pieces under this
                fraction of the largest one's area are removed
     losses, descent: see there; `losses=dict(mask=0.1)` changes one entry
@@ -65,6 +81,10 @@ class FitSettings:
     voxel: float | None = None
     levels: int | None = None
     box: tuple[float, ...] | None = None
+    gains: str = "auto"
+    gain_per: str = "channel"
+    start: str = "constant"
+    upscale: str = "plain"
     seed: int = 0
     device: str = "cpu"
     threshold: float | None = None
@@ -94,9 +114,11 @@ class FitSettings:
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
             ("voxel", settings.voxel is None or settings.voxel > 0),
             ("levels", settings.levels is None or settings.levels >= 1),
+            *((name, getattr(settings, name) in words) for name, words in CHOICES.items()),
+            ("losses.sample_target", settings.losses.sample_target in SAMPLE_TARGETS),
         ):
             if not sound:
                 raise ValueError(
-                    f"fit: {name} is {getattr(settings, name)}, see FitSettings for what it may be"
+                    f"fit: {name} is {operator.attrgetter(name)(settings)!r}, see FitSettings for what it may be"
                 )
         return settings

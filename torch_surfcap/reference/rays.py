@@ -182,12 +182,14 @@ def photometric_step(
     detach_sample: bool = False,
     groups: int = 1,
     ranges: tuple[Tensor, Tensor] | None = None,
+    gradients: Tensor | None = None,
+    rendered_sample: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Losses [3] (photo, sample: eq. 10, mask), gradient of weights · losses, colour [R,3], transmittance
     [R].
 
-    target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss. `ranges`, which save
-    the compiled op a search, are not looked at.
+    target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss. `ranges` and
+    `gradients`, which save the compiled op a search and memory, are not looked at.
     """
     leaf = voxels.detach().requires_grad_()
     m = march(leaf, table, frame, origins, directions, shift, opacity, slope, step, stop)
@@ -195,7 +197,8 @@ def photometric_step(
     color = (m.weight[..., None] * m.color).sum(1) + left[:, None] * background
     w = m.weight.detach() if detach_sample else m.weight
     photo = huber_norm(color - target, huber).sum(-1)
-    sample = (w * huber_norm(m.color - target[:, None], huber).sum(-1)).sum(1)
+    own_target = color.detach() if rendered_sample else target
+    sample = (w * huber_norm(m.color - own_target[:, None], huber).sum(-1)).sum(1)
     losses = torch.stack([(weight * term).sum() for term in (photo, sample, (left - (1 - mask)) ** 2)])
     (gradient,) = torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)
     return losses.detach().double(), gradient, color.detach(), left.detach()

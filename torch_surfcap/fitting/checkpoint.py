@@ -1,0 +1,184 @@
+"""Checkpoints: all that the rest of a fit depends on, in one file that is complete or absent and holds no pickle.
+
+A fit that goes on from one ends with the same bits as one that was never stopped. What follows from the photographs
+(pictures at every size, rays through given pixels, their colours) is made again; what the fit found is kept.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import zipfile
+import zlib
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.files import atomic_write
+from torch_surfcap.errors import InputError
+from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.adam import TileAdam
+from torch_surfcap.fitting.color_gain import Exposure
+from torch_surfcap.fitting.levels import Level
+from torch_surfcap.fitting.plateau import Plateau
+from torch_surfcap.fitting.rays import rays_of
+from torch_surfcap.fitting.settings import FitSettings
+from torch_surfcap.fitting.stage import Stage, Studio, march_of
+from torch_surfcap.version import VERSION
+
+
+@dataclass
+class Record:
+    """What a fit has to tell so far. warnings; history: a row per iteration; seconds: of the levels that are done;
+    level_bytes: what each level was estimated to need."""
+
+    warnings: list[str] = field(default_factory=list)
+    history: list[dict[str, float]] = field(default_factory=list)
+    seconds: list[dict[str, float]] = field(default_factory=list)
+    level_bytes: list[int] = field(default_factory=list)
+
+
+@dataclass
+class Saved:
+    """What a checkpoint holds. arrays: numpy arrays by name; plain: what JSON can say."""
+
+    arrays: dict[str, np.ndarray[Any, Any]]
+    plain: dict[str, Any]
+
+    @property
+    def place(self) -> list[int]:
+        """[level, iteration], counted from 0: the next one to be done."""
+        return [self.plain["number"], self.plain["rule"]["count"]]
+
+    @property
+    def label(self) -> str:
+        return str(self.plain["label"])
+
+    @property
+    def box(self) -> tuple[Tensor, Tensor]:
+        low, high = torch.tensor(self.plain["box"], dtype=torch.float64)
+        return low, high
+
+    def stage(self, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:
+        """The stage as it was; the studio gets its exposure and random numbers back."""
+        arrays, plain = {name: torch.from_numpy(a) for name, a in self.arrays.items()}, self.plain
+        studio.exposure = Exposure(arrays["gain"], arrays["bias"])
+        studio.gains, studio.spread = plain["gains"], plain["spread"]
+        studio.generator.set_state(arrays["generator"])
+        x, y, z = plain["origin"]
+        grid = TileGrid(arrays["table"], arrays["coords"], (x, y, z), plain["voxel_size"])
+        number = plain["number"]
+        level, store = plan[number], arrays["store"]
+        capture = studio.pictures[level.halvings]
+        pixels = arrays["pixels"].split(plain["rays_per_camera"])
+        counts = arrays["range_counts"].long()
+        offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        rays = rays_of(capture, grid, list(pixels), (offsets, arrays["ranges"]))
+        rays.expose(capture, studio.backdrop, studio.exposure)
+        adam = TileAdam(store, settings.opacity, settings.descent)
+        adam.first, adam.second, adam.t = arrays["first"], arrays["second"], plain["t"]
+        march = march_of(settings, level, number == len(plan) - 1)
+        rule = Plateau(**plain["rule"])
+        return Stage(number, level, grid, store, march, rays, adam, rule, plain["moved"], plain["seconds"])
+
+
+@dataclass
+class Checkpoints:
+    """Where, and how often, a fit leaves checkpoints.
+
+    path: the file. seconds: least time between two within a level; one is written at every change of level too.
+    resume: begin with the one that is there. label: whatever the caller wants to find in it again.
+    """
+
+    path: Path
+    seconds: float = 60.0
+    resume: bool = False
+    label: str = ""
+    last: float = field(default_factory=time.monotonic)
+
+    def due(self) -> bool:
+        return time.monotonic() - self.last >= self.seconds
+
+    def save(
+        self,
+        settings: FitSettings,
+        capture: Capture,
+        box: tuple[Tensor, Tensor],
+        stage: Stage,
+        studio: Studio,
+        record: Record,
+    ) -> None:
+        """Replaces the file."""
+        rays, grid = stage.rays, stage.grid
+        offsets, ranges = rays.ranges
+        plain = {
+            "version": VERSION,
+            "label": self.label,
+            "settings": asdict(settings),
+            "cameras": capture.names,
+            "number": stage.number,
+            "rule": asdict(stage.rule),
+            "moved": stage.moved,
+            "seconds": stage.seconds,
+            "t": stage.adam.t,
+            "origin": grid.origin,
+            "voxel_size": grid.voxel_size,
+            "gains": studio.gains,
+            "rays_per_camera": np.diff(rays.camera_starts).tolist(),
+            "spread": studio.spread,
+            "box": torch.stack(box).tolist(),
+            "record": asdict(record),
+        }
+        arrays = {
+            "store": stage.store,
+            "first": stage.adam.first,
+            "second": stage.adam.second,
+            "table": grid.table,
+            "coords": grid.coords,
+            "pixels": rays.pixels,
+            "range_counts": offsets.diff().int(),
+            "ranges": ranges,
+            "generator": studio.generator.get_state(),
+            "gain": studio.exposure.gain,
+            "bias": studio.exposure.bias,
+        }
+        data: dict[str, Any] = {name: array.numpy() for name, array in arrays.items()}
+        data["plain"] = np.frombuffer(json.dumps(plain).encode(), dtype=np.uint8)
+        with atomic_write(self.path) as partial, open(partial, "wb") as file:
+            np.savez(file, **data)
+        self.last = time.monotonic()
+
+    def load(self) -> Saved | None:
+        """The checkpoint to begin with; None where there is none, or none is wanted.
+
+        Raises InputError for a file that is no checkpoint or another version's.
+        """
+        if not (self.resume and self.path.exists()):
+            return None
+        try:
+            with np.load(self.path, allow_pickle=False) as data:
+                arrays = {name: data[name] for name in data.files}
+            plain = json.loads(bytes(arrays.pop("plain")).decode())
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"{self.path}: a damaged checkpoint ({error}), expected one of a fit") from error
+        if plain["version"] != VERSION:
+            raise InputError(
+                f"{self.path}: written by version {plain['version']}, expected {VERSION}, this one's"
+            )
+        return Saved(arrays, plain)
+
+    def check(self, saved: Saved, settings: FitSettings, capture: Capture) -> None:
+        """Raises InputError where a checkpoint is of other settings or other cameras."""
+        plain = json.loads(json.dumps(asdict(settings)))
+        for name, value in saved.plain["settings"].items():
+            if name != "device" and plain.get(name) != value:
+                raise InputError(
+                    f"{self.path}: {name} is {value} there and {plain.get(name)} now, expected the same to resume"
+                )
+        if saved.plain["cameras"] != capture.names:
+            raise InputError(f"{self.path}: of other cameras, expected the same capture to resume")

@@ -1,0 +1,129 @@
+"""A stage of the fit: one level with all that its iterations read and change."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torch_surfcap import ops
+from torch_surfcap.autograd import March
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.field.field import SLOPE
+from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.adam import TileAdam
+from torch_surfcap.fitting.color_gain import Exposure
+from torch_surfcap.fitting.levels import Level, next_level
+from torch_surfcap.fitting.plateau import Plateau
+from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, gather_rays
+from torch_surfcap.fitting.settings import FitSettings
+
+NOTICEABLE = 0.01  # change of a medium brightness by gain and bias, the median over the cameras
+
+
+@dataclass
+class Studio:
+    """What does not belong to one level: the photographs at every size and the cameras' exposure.
+
+    pictures: the capture, halved 0, 1, ... times. backdrop: see ``RayBatch.expose``. generator: of the lattices' shifts.
+    gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera. spread: how
+    much the cameras were found to differ, see ``Exposure.spread``.
+    """
+
+    pictures: list[Capture]
+    backdrop: Tensor | None
+    exposure: Exposure
+    gains: bool
+    per_channel: bool
+    generator: torch.Generator
+    spread: float | None = None
+
+    def fit_exposure(self, stage: Stage, color: Tensor, transmittance: Tensor) -> None:
+        """Takes the cameras' gains out of renderings of a stage's rays, [R, 3] and [R], and exposes the rays anew."""
+        capture = self.pictures[stage.level.halvings]
+        equations = stage.rays.equations(capture, self.backdrop, color, transmittance)
+        self.exposure = equations.solve(self.per_channel)
+        self.spread = self.exposure.spread()
+        stage.rays.expose(capture, self.backdrop, self.exposure)
+
+    def settle_gains(self) -> None:
+        """Leaves the pictures as they are for good if the gains found so far are too small to matter."""
+        if self.spread is not None and self.spread < NOTICEABLE:
+            self.gains, self.exposure = False, Exposure.equal(len(self.pictures[0]))
+
+
+@dataclass
+class Stage:
+    """One level of the fit.
+
+    number: of the level, from 0. level: its plan. grid, store: the field, padded records [T, 4, 4, 4, P]. moved:
+    iterations at full rate since the integration ranges were found. seconds: spent per kind of work.
+    """
+
+    number: int
+    level: Level
+    grid: TileGrid
+    store: Tensor
+    march: March
+    rays: RayBatch
+    adam: TileAdam
+    rule: Plateau
+    moved: float = 0.0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def march_of(settings: FitSettings, level: Level, last: bool) -> March:
+    """How the rays of a level are sampled."""
+    step = settings.descent.last_step if last else settings.descent.step
+    return March(ops.OPACITY[settings.opacity], SLOPE, step * level.voxel_size, settings.descent.stop)
+
+
+def begin_stage(
+    settings: FitSettings, plan: list[Level], number: int, grid: TileGrid, store: Tensor, studio: Studio
+) -> Stage:
+    """A level before its first iteration: rays gathered, Adam at rest."""
+    level = plan[number]
+    march = march_of(settings, level, number == len(plan) - 1)
+    capture = studio.pictures[level.halvings]
+    rays = gather_rays(capture, store, grid, settings.opacity, march)
+    rays.expose(capture, studio.backdrop, studio.exposure)
+    adam = TileAdam(store, settings.opacity, settings.descent)
+    return Stage(number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations))
+
+
+def open_studio(capture: Capture, settings: FitSettings, halvings: int) -> Studio:
+    """The pictures down to so many halvings, all exposed as they are."""
+    pictures = [capture]
+    while len(pictures) <= halvings:
+        pictures.append(pictures[-1].halved())
+    generator = torch.Generator().manual_seed(settings.seed)
+    equal = Exposure.equal(len(capture))
+    per_channel = settings.gain_per == "channel"
+    return Studio(pictures, choose_backdrop(capture), equal, settings.gains != "off", per_channel, generator)
+
+
+def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:
+    """The level after one that is done."""
+    watch = Stopwatch({})
+    if stage.number == 0 and settings.gains == "auto":
+        studio.settle_gains()
+    grid, store = next_level(stage.grid, stage.store, settings, stage.rays, stage.march)
+    following = begin_stage(settings, plan, stage.number + 1, grid, store, studio)
+    watch.lap("prepare")
+    following.seconds |= watch.seconds
+    return following
+
+
+class Stopwatch:
+    """Adds up seconds by kind of work."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self.seconds = seconds
+        self.last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
+        self.last = now
