@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from torch_surfcap.fitting.fit import Progress
 from train import fit as command
 
 KILLS = int(os.environ.get("SURFCAP_KILLS", "3"))
-QUICK = {"sh_degree": 0, "levels": 2, "voxel": 0.05}
+QUICK: dict[str, Any] = {"sh_degree": 0, "levels": 2, "voxel": 0.05}
 # The command, with a journal of its iterations and checkpoints.
 WATCHED = """
 import sys
@@ -53,7 +54,7 @@ class Killed(Exception):
 
 @pytest.mark.parametrize("settings", [{}, {"opacity": "transparency"}, {"gains": "on"}], ids=str)
 @pytest.mark.parametrize("moment", [3, 17, 40])
-def test_the_same_bits_after_any_iteration(settings: dict[str, str], moment: int, tmp_path: Path) -> None:
+def test_the_same_bits_after_any_iteration(settings: dict[str, Any], moment: int, tmp_path: Path) -> None:
     """Stopped after a checkpoint within a level, whichever it is; nothing is lost and nothing done twice."""
     capture, path = ball(8, 32), tmp_path / "checkpoint.npz"
     whole = fit(capture, **QUICK, **settings)
@@ -83,7 +84,7 @@ def test_checkpoints_of_something_else(tmp_path: Path) -> None:
     capture, path = ball(6, 32), tmp_path / "checkpoint.npz"
     fit(capture, None, Checkpoints(path, seconds=0), **QUICK)
 
-    def refused(*, message: str, **settings: object) -> None:
+    def refused(*, message: str, **settings: Any) -> None:
         with pytest.raises(InputError, match=message) as caught:
             fit(capture, None, Checkpoints(path, resume=True), **{**QUICK, **settings})
         assert str(path) in str(caught.value)

@@ -45,13 +45,8 @@ EVALUATED = (
     "error.png",
 )  # by evaluate.py; they go with the results they are of
 CHECKPOINT = "checkpoint.npz"
-FREE_KEYS = {
-    "out",
-    "device",
-    "overwrite",
-    "resume",
-    "checkpoint",
-}  # may differ between a run and its resumption
+# May differ between a run and its resumption.
+FREE_KEYS = {"out", "device", "overwrite", "resume", "checkpoint"}
 SHOWN = {"psnr_volume": "PSNR volume", "psnr_raster": "PSNR raster", "psnr_masked": "PSNR masked"}
 
 
@@ -64,15 +59,15 @@ def main(arguments: Sequence[str] | None = None, started: float = 0.0) -> int:
     parser.add_argument("settings", nargs="*", metavar="key=value", help="come after the file's")
     options = parser.parse_intermixed_args(arguments)
     try:
-        run(settings.resolved(settings.load(options.config, options.settings)), started)
+        config = settings.resolved(settings.load(options.config, options.settings))
+        run(config, started)
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(
-            "interrupted, no results were written; resume=true goes on from the last checkpoint",
-            file=sys.stderr,
-        )
+        left = Path(config.out) / CHECKPOINT
+        rest = f"resume=true goes on from {left}" if left.exists() else "nothing was written"
+        print(f"interrupted, {rest}", file=sys.stderr)
         return 130
     return 0
 

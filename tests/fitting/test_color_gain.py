@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
 from tests.fitting.sphere import ball
 from torch_surfcap import Capture, fit
-from torch_surfcap.fitting.color_gain import PRIOR, Equations, Exposure
+from torch_surfcap.fitting.color_gain import Equations, Exposure
 
 TRUE = torch.tensor([[1.25, 0.02], [0.8, -0.01], [1.0, 0.03], [0.9, -0.02]])  # gain and bias of four pictures
 
@@ -17,8 +19,8 @@ def test_two_rays_by_hand() -> None:
     """Field 0.2 and 0.6 photographed as 0.5 F + 0.1: gain 2, bias -0.2; the prior pulls a little towards 1 and 0."""
     field = torch.tensor([[0.2] * 3, [0.6] * 3]).repeat(50_000, 1)
     found = Equations.of(0.5 * field + 0.1, field).solve(gauge=False)
-    torch.testing.assert_close(found.gain, torch.full((1, 3), 2.0), rtol=2e-3, atol=0)
-    torch.testing.assert_close(found.bias, torch.full((1, 3), -0.2), rtol=0, atol=1e-3)
+    torch.testing.assert_close(found.gain, torch.full((1, 3), 2.0), rtol=1e-4, atol=0)
+    torch.testing.assert_close(found.bias, torch.full((1, 3), -0.2), rtol=0, atol=1e-4)
 
 
 def test_what_a_gain_and_bias_do() -> None:
@@ -84,7 +86,6 @@ def test_a_camera_that_sees_nothing_stays_as_it_is() -> None:
     found = nothing.solve(gauge=False)
     assert torch.equal(found.gain, torch.ones(1, 3))
     assert torch.equal(found.bias, torch.zeros(1, 3))
-    assert PRIOR > 0
 
 
 @pytest.mark.parametrize("plates", [False, True])
@@ -101,11 +102,11 @@ def test_a_ball_in_different_light(plates: bool) -> None:
         plates_in = [plate / gain for plate, gain in zip(true.plates, gains, strict=True)]
     capture = Capture(images, true.cameras.K, true.cameras.world_to_camera, true.masks, plates_in)
     capture.mask_source = true.mask_source
-    settings = {"sh_degree": 0, "levels": 2, "voxel": 1 / 40}
+    settings: dict[str, Any] = {"sh_degree": 0, "levels": 2, "voxel": 1 / 40}
     result = fit(capture, **settings)
     assert result.chosen["gains"]["value"] == "on"
     error = (result.gain - (gains / gains.mean())[:, None]).abs()
-    assert error.median() < 0.02
+    assert error.median() < 0.01
     assert result.bias.abs().median() < 0.02
     plain = fit(capture, gains="off", **settings)
     assert (plain.gain == 1).all()

@@ -20,7 +20,7 @@ from torch import Tensor
 
 SATURATED = 0.01  # values nearer than this to 0 or 1 are clipped, or averages of clipped ones
 OPAQUE = 0.5  # a ray of less transmittance shows the field
-PRIOR = 10.0  # a camera that sees next to nothing stays at g = 1, b = 0: weight of that, in rays
+PRIOR = 1e-3  # a camera that sees next to nothing stays at g = 1, b = 0: weight of that, in rays
 
 
 @dataclass(frozen=True)
