@@ -14,7 +14,6 @@ from tests.surface.shapes import CENTER, RADIUS, ball
 from torch_surfcap import config as settings
 from torch_surfcap import report
 from torch_surfcap.data.cameras import Cameras
-from torch_surfcap.data.geometry import read_points
 from torch_surfcap.surface.extract import extract_mesh
 from torch_surfcap.surface.render import mesh_mask, volume
 from train import evaluate
@@ -105,14 +104,6 @@ def test_protocol_nerf_is_full_size_over_white(folder: Path, tmp_path: Path) -> 
     assert evaluate.main(["--run", str(tmp_path), "--protocol", "nerf"]) == 0
     full, nerf = (json.loads((p / "evaluation.json").read_text()) for p in (folder / "run", tmp_path))
     assert nerf["test"] == full["test"]
-
-
-def test_points_of_other_files(folder: Path, tmp_path: Path) -> None:
-    expected = np.load(folder / "truth" / "points.npz")["points"]
-    np.savez(tmp_path / "other.npz", xyz=expected)
-    np.testing.assert_array_equal(read_points(tmp_path / "other.npz"), expected)
-    found = read_points(folder / "truth" / "gt.ply")
-    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

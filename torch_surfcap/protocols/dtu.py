@@ -1,13 +1,14 @@
 """The surface protocol of the DTU data set: a mesh against the points of a structured-light scanner.
 
 The rules are those of Jensen et al., "Large Scale Multi-view Stereopsis Evaluation", CVPR 2014, as papers on surfaces from
-pictures apply them to meshes (DTUeval-python, which agrees with the official program to 0.02 %). Lengths are millimetres.
+pictures apply them to meshes (DTUeval-python, on average within 0.02 % of the official program). Lengths are in mm.
 
-1. The mesh becomes points, its vertices and a lattice with cells of spacing² on every triangle that is large enough,
-   which are thinned in a random order until no two are closer than the spacing.
+1. The mesh becomes points, its vertices and a lattice with cells of spacing² on every triangle that is large enough.
+   Those beyond a margin around the scan's box go; the rest is thinned in a random order until no two are closer than
+   the spacing.
 2. Accuracy is the mean distance of those inside the observation mask, the space the scanner saw, to the scan.
-3. Completeness is the mean distance of the scanned points above the ground plane to the mesh's points, to those outside
-   the mask as well: it says what can be judged, not what is there.
+3. Completeness is the mean distance of the scanned points above the ground plane to the mesh's points, whether these
+   are inside the mask or not.
 4. A distance of `farthest` or more counts in neither mean. Overall is the mean of the two.
 """
 
