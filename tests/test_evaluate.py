@@ -106,14 +106,6 @@ def test_protocol_nerf_is_full_size_over_white(folder: Path, tmp_path: Path) -> 
     assert nerf["test"] == full["test"]
 
 
-def test_points_of_other_files(folder: Path, tmp_path: Path) -> None:
-    expected = np.load(folder / "truth" / "points.npz")["points"]
-    np.savez(tmp_path / "other.npz", xyz=expected)
-    np.testing.assert_array_equal(evaluate.read_points(tmp_path / "other.npz"), expected)
-    found = evaluate.read_points(folder / "truth" / "gt.ply")
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

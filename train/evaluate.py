@@ -1,12 +1,19 @@
-"""Score a finished run on the views it never saw and, where it is known, against the true surface.
+"""Score finished runs on the views they never saw and, where it is known, against the true surface.
 
     python train/evaluate.py --run OUT [--mesh-truth gt.ply] [--points-truth gt_visible.npz] [--concave concave.npz]
+    python train/evaluate.py --run OUT/chair OUT/drums ... --protocol nerf --table nerf.md
+    python train/evaluate.py --run OUT --protocol dtu --dtu-truth FOLDER --scan 65 [--cull masks]
 
-Reads OUT/config.yaml, OUT/field.npz and OUT/mesh.ply. Writes OUT/evaluation.json and, with --mesh-truth, OUT/error.ply
-(the mesh coloured by its distance to the truth, green beyond the cut) and OUT/error.png. Exit 2 for bad input.
+Reads OUT/config.yaml, OUT/field.npz and OUT/mesh.ply, and OUT/metrics.json for what the fit took. Writes
+OUT/evaluation.json and, with --mesh-truth, OUT/error.ply (the mesh coloured by its distance to the truth, green beyond
+the cut) and OUT/error.png. Exit 2 for bad input.
 
-Protocols: `default` scores the views as the run was told to read them; `nerf` the whole test split at full size over
-white, whatever scale the run was fitted at.
+Protocols: `default` scores the views as the run was told to read them. The others score pictures of full size, with the
+data set's masks over white, whatever scale the run was fitted at, and print a table of the runs with their mean:
+
+    nerf  the whole test split of NeRF-synthetic, transforms_test.json, whatever the run held out
+    dtu   the views of the fit, within their masks, and the mesh against the scanner's points, by the rules written in
+          torch_surfcap/protocols/dtu.py; by default nothing of the mesh is culled, as in NeuS's tables with masks
 """
 
 from __future__ import annotations
@@ -15,25 +22,27 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from torch_surfcap import config as settings
 from torch_surfcap import report
 from torch_surfcap.data.capture import Capture, load_capture
+from torch_surfcap.data.geometry import Points, read_mesh, read_points
+from torch_surfcap.data.parse import read_json
 from torch_surfcap.distance import SurfaceDistance
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.metrics import surface_scores
-
-Points = NDArray[np.float64]
+from torch_surfcap.protocols import dtu, table
 
 ERROR_SCALE = 0.1  # of the cut: distance at the dark end of the error mesh's colours
 ERROR_VIEWS = 4
+FILES = ("config.yaml", "field.npz", "mesh.ply")  # of a finished run, without which it cannot be scored
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -47,24 +56,63 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def evaluate(options: argparse.Namespace) -> dict[str, Any]:
-    """Score the run named by the options, write the results beside it, print and return them."""
+def evaluate(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Score the runs named by the options, write the results beside each, print and return them."""
+    runs = [Path(run) for run in options.run]
+    _check(options, runs)
+    found = []
+    for i, run in enumerate(runs):
+        scan = None if options.protocol != "dtu" else dtu.read_scan(Path(options.dtu_truth), options.scan[i])
+        found.append(_score(run, scan, options))
+        report.write_json(run / "evaluation.json", found[-1])
+        _print(found[-1])
+    if options.protocol != "default" or options.table is not None:
+        content = table.table(options.protocol, found)
+        print(table.markdown(content), end="")
+        if options.table is not None:
+            table.write(Path(options.table), content)
+    return found
+
+
+def _check(options: argparse.Namespace, runs: list[Path]) -> None:
+    """Raise InputError for options that do not go together and for runs that are not finished, before any scoring."""
+    protocol, scans = f"--protocol {options.protocol}", len(options.scan or ())
+    if options.protocol == "dtu":
+        if options.dtu_truth is None or scans != len(runs):
+            found = f"--dtu-truth {options.dtu_truth} and {scans} scans for {len(runs)} runs"
+            raise InputError(f"{protocol}: {found}, expected the folder of DTU's truth and a scan per run")
+        if options.mesh_truth or options.points_truth or options.concave:
+            raise InputError(f"{protocol}: a second truth is given, expected --dtu-truth alone")
+    elif options.dtu_truth or options.scan or options.cull != "none":
+        raise InputError(f"{protocol}: --dtu-truth, --scan or --cull is given, expected --protocol dtu")
+    if options.table is not None and Path(options.table).suffix != ".md":
+        raise InputError(f"--table {options.table}: expected a name in .md, the same in .json goes beside it")
+    for run in runs:
+        for name in FILES:
+            if not (run / name).is_file():
+                raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
+
+
+def _score(run: Path, scan: dtu.Scan | None, options: argparse.Namespace) -> dict[str, Any]:
+    """The results of one run, as evaluation.json gets them."""
     start = time.perf_counter()
-    run = Path(options.run)
     config, field, mesh = read_run(run)
     capture = _capture(config, options.protocol)
     truth = None if options.mesh_truth is None else read_mesh(Path(options.mesh_truth))
     points = None if options.points_truth is None else read_points(Path(options.points_truth))
     concave = _concave(options)
-    results: dict[str, Any] = {"run": str(run), "protocol": options.protocol}
-    splits = {"test": capture.test, "train": capture if options.train else None}
+    results: dict[str, Any] = {"run": str(run), "scene": _scene(config), "protocol": options.protocol}
+    if scan is not None:
+        results["surface"] = _scan_scores(mesh, scan, capture, options)
+    elif truth is not None or points is not None or concave is not None:
+        results["surface"] = surface_scores(mesh, truth, points, concave, options.cut, options.cut / 5)
+    splits = {"test": capture.test, "train": capture if options.train or scan is not None else None}
     for name, views in splits.items():
         if views is not None:
             each = [report.score_view(field, mesh, views, i) for i in range(len(views))]
             results[name] = {**report.mean_scores(each), "each": dict(zip(views.names, each, strict=True))}
-    if truth is not None or points is not None or concave is not None:
-        results["surface"] = surface_scores(mesh, truth, points, concave, options.cut, options.cut / 5)
     results["triangles"] = len(mesh.faces)
+    results["fit"] = _cost(run)
     results["seconds"] = time.perf_counter() - start
     if truth is not None:
         distance = SurfaceDistance(truth)(np.asarray(mesh.vertices), options.cut).distance
@@ -72,45 +120,43 @@ def evaluate(options: argparse.Namespace) -> dict[str, Any]:
         report.write_mesh(run / "error.ply", painted)
         shown = report.some_views(len(capture), ERROR_VIEWS)
         report.write_errors(run / "error.png", painted, capture.cameras, shown, ERROR_SCALE * options.cut)
-    report.write_json(run / "evaluation.json", results)
-    _print(results)
     return results
 
 
+def _scene(config: settings.Config) -> str:
+    """The name of the capture's folder."""
+    path = Path(config.data.path).absolute()
+    return (path if path.is_dir() else path.parent).name
+
+
+def _scan_scores(
+    mesh: trimesh.Trimesh, scan: dtu.Scan, capture: Capture, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Scores of a mesh against a scan, and under "cuts" what they leave out."""
+    cuts: dict[str, Any] = {"scan": scan.number, **asdict(dtu.Cuts()), "cull": options.cull}
+    if options.cull == "masks":
+        cuts["dilation"] = options.dilation
+        views = [capture] if capture.test is None else [capture, capture.test]
+        mesh = dtu.culled(mesh, views, options.dilation)
+    return {**dtu.scan_scores(mesh, scan), "cuts": cuts}
+
+
+def _cost(run: Path) -> dict[str, Any]:
+    """What the fit took, by its metrics.json where there is one: "seconds", "peak_memory_bytes"."""
+    path = run / "metrics.json"
+    if not path.is_file():
+        return {}
+    metrics = read_json(path)
+    try:
+        return {"seconds": metrics["seconds"]["total"], "peak_memory_bytes": metrics["peak_memory_bytes"]}
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: no {error}, expected the metrics.json of a fit") from error
+
+
 def read_run(run: Path) -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]:
-    """Config, field and mesh of a finished run. Raises InputError naming the file that is missing or damaged."""
-    for name in ("config.yaml", "field.npz", "mesh.ply"):
-        if not (run / name).is_file():
-            raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
+    """Config, field and mesh of a finished run. Raises InputError naming the file that is damaged."""
     config = settings.load(run / "config.yaml")
     return config, SurfaceField.load(run / "field.npz"), read_mesh(run / "mesh.ply")
-
-
-def read_mesh(path: Path) -> trimesh.Trimesh:
-    """A triangle mesh. Raises InputError naming the file where it is missing, damaged or without triangles."""
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
-        raise InputError(f"{path}: {error}, expected a triangle mesh") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{path}: no triangles, expected a triangle mesh")
-    return mesh
-
-
-def read_points(path: Path) -> Points:
-    """Points [P, 3]: "points", or the only table of numbers, of an .npz; the vertices of anything else trimesh reads."""
-    try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                names = [name for name in file.files if file[name].ndim == 2 and file[name].dtype.kind == "f"]
-                points = file["points" if "points" in names or len(names) != 1 else names[0]]
-        else:
-            points = np.asarray(getattr(trimesh.load(path, process=False), "vertices", ()))
-    except Exception as error:  # as in read_mesh
-        raise InputError(f"{path}: {error}, expected points") from error
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
-        raise InputError(f"{path}: an array of shape {list(points.shape)}, expected finite points [P, 3]")
-    return np.asarray(points, dtype=np.float64)
 
 
 def _concave(options: argparse.Namespace) -> Points | None:
@@ -123,26 +169,31 @@ def _concave(options: argparse.Namespace) -> Points | None:
 
 
 def _capture(config: settings.Config, protocol: str) -> Capture:
+    """The run's views as the protocol reads them, with a line for each that is left out."""
     data, skip = config.data, config.cameras.skip
     if protocol == "default":
-        return load_capture(data.path, data.format, data.scale, data.holdout, data.masks, data.plates, skip)
-    capture = load_capture(data.path, data.format, 1.0, data.holdout, True, False, skip)
-    if capture.test is None:
-        raise InputError(f"{data.path}: no held-out views, expected a test split for the protocol nerf")
+        capture = load_capture(
+            data.path, data.format, data.scale, data.holdout, data.masks, data.plates, skip
+        )
+    else:
+        holdout = 0 if protocol == "nerf" else data.holdout
+        capture = load_capture(data.path, data.format, 1.0, holdout, True, False, skip)
+    if protocol == "nerf" and capture.test is None:
+        raise InputError(f"{data.path}: no transforms_test.json, expected the test split of NeRF-synthetic")
+    for warning in capture.warnings:
+        print(f"warning: {warning}")
     return capture
 
 
 def _print(results: dict[str, Any]) -> None:
+    print(results["run"])
     for split in ("test", "train"):
         if split in results:
             _table(f"{split} views", {k: v for k, v in results[split].items() if k != "each"})
-    if "test" not in results:
-        print(
-            "no held-out views: nothing to score pictures on"
-            + ("" if "train" in results else " (--train does)")
-        )
+    if "test" not in results and "train" not in results:
+        print("no held-out views: nothing to score pictures on (--train does)")
     if "surface" in results:
-        _table("surface, world units", results["surface"])
+        _table("surface, world units", {k: v for k, v in results["surface"].items() if k != "cuts"})
     print(f"{results['triangles']} triangles, {results['seconds']:.1f} s")
 
 
@@ -156,7 +207,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--run", required=True, metavar="OUT", help="folder of a finished fit")
+    parser.add_argument("--run", required=True, nargs="+", metavar="OUT", help="folders of finished fits")
     parser.add_argument("--mesh-truth", metavar="MESH", help="true surface")
     parser.add_argument(
         "--points-truth", metavar="NPZ", help="points of the true surface that the cameras see"
@@ -165,8 +216,29 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--concave", metavar="NPZ", help="points within concavities; concave.npz beside the truth"
     )
     parser.add_argument("--cut", type=float, default=0.05, help="longest distance that counts, world units")
-    parser.add_argument("--protocol", choices=["default", "nerf"], default="default")
-    parser.add_argument("--train", action="store_true", help="score the views of the fit as well")
+    parser.add_argument("--protocol", choices=list(table.COLUMNS), default="default")
+    parser.add_argument(
+        "--train", action="store_true", help="score the views of the fit as well; dtu always does"
+    )
+    parser.add_argument(
+        "--table", metavar="FILE.md", help="write the table of the runs and their mean, as FILE.json too"
+    )
+    parser.add_argument("--dtu-truth", metavar="FOLDER", help="with DTU's Points/stl and ObsMask")
+    parser.add_argument(
+        "--scan", type=int, nargs="+", metavar="N", help="number of DTU's object, one per run"
+    )
+    parser.add_argument(
+        "--cull",
+        choices=["none", "masks"],
+        default="none",
+        help="what of the mesh is left out: nothing, or what lies outside a dilated mask (UNISURF, 2DGS)",
+    )
+    parser.add_argument(
+        "--dilation",
+        type=float,
+        default=24.0,
+        help="of the masks that cull, pixels: 24 as 2DGS; NeuralWarp takes 12, NeuS without masks 50",
+    )
     return parser.parse_args(arguments)
 
 
