@@ -78,6 +78,7 @@ class DescentConfig:
 @dataclass
 class CamerasConfig:
     skip: list[str] = field(default_factory=list)  # names or numbers of cameras to leave out
+    take: int = _within(0, 0)  # so many training cameras, evenly spread; 0: all
 
 
 @dataclass
@@ -132,6 +133,21 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Sequence[str] = 
     assert isinstance(config, Config)
     _check(config, str(path or "settings"))
     return config
+
+
+def capture_arguments(config: Config) -> dict[str, Any]:
+    """What `torch_surfcap.load_capture` takes of a config."""
+    data, cameras = config.data, config.cameras
+    return {
+        "path": data.path,
+        "format": data.format,
+        "scale": data.scale,
+        "holdout": data.holdout,
+        "masks": data.masks,
+        "plates": data.plates,
+        "skip": cameras.skip,
+        "take": cameras.take,
+    }
 
 
 def fit_arguments(config: Config) -> dict[str, Any]:

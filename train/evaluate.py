@@ -123,12 +123,14 @@ def _concave(options: argparse.Namespace) -> Points | None:
 
 
 def _capture(config: settings.Config, protocol: str) -> Capture:
-    data, skip = config.data, config.cameras.skip
+    arguments = settings.capture_arguments(config)
     if protocol == "default":
-        return load_capture(data.path, data.format, data.scale, data.holdout, data.masks, data.plates, skip)
-    capture = load_capture(data.path, data.format, 1.0, data.holdout, True, False, skip)
+        return load_capture(**arguments)
+    capture = load_capture(**arguments | {"scale": 1.0, "masks": True, "plates": False})
     if capture.test is None:
-        raise InputError(f"{data.path}: no held-out views, expected a test split for the protocol nerf")
+        raise InputError(
+            f"{config.data.path}: no held-out views, expected a test split for the protocol nerf"
+        )
     return capture
 
 
