@@ -12,7 +12,7 @@ from torch_surfcap.autograd import March
 from torch_surfcap.field.field import MISSING, SLOPE
 from torch_surfcap.field.tiles import TileGrid, voxel_centers
 from torch_surfcap.fitting.levels import first_field
-from torch_surfcap.fitting.rays import BLOCK, choose_backdrop, find_ranges, gather_rays
+from torch_surfcap.fitting.rays import BLOCK, RayBatch, choose_backdrop, find_ranges, gather_rays
 
 center = torch.tensor(CENTER, dtype=torch.float64)
 BOX = (center - 0.35, center + 0.35)
@@ -60,6 +60,14 @@ def test_every_ray_that_meets_the_surface_is_there(opacity: str) -> None:
         block = (row // BLOCK) * 99 + column // BLOCK
         runs = 1 + int((block.diff() != 0).sum())
         assert runs == len(block.unique())  # block by block
+
+
+def test_samples_are_counted_over_the_ranges() -> None:
+    """Ranges of 1 and 0.5, with samples 0.25 apart: 4 and 2."""
+    one = torch.zeros(2, 3)
+    ranges = (torch.tensor([0, 1, 2]), torch.tensor([[1.0, 2.0], [3.0, 3.5]]))
+    rays = RayBatch(one, one, one, one, one[:, 0], one[:, 0], ranges, [0, 2])
+    assert rays.samples(0.25) == 6
 
 
 def test_weights_do_not_depend_on_cameras_pixels_or_voxels() -> None:

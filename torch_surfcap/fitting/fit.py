@@ -115,7 +115,7 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
         rays = gather_rays(pictures[level.halvings], store, grid, s.opacity, march, backdrop)
         level_watch.lap("prepare")
         for row in descend(store, grid, rays, s, march, level.iterations, generator, spent):
-            history.append({"level": float(number)} | row)
+            history.append({"level": float(number), "samples": rays.samples(march.step)} | row)
             report(Progress(number, len(plan), level, len(store) * ops.TILE**3, row))
         by_level.append(spent)
     watch.lap("fit")

@@ -40,6 +40,12 @@ class RayBatch:
     def __len__(self) -> int:
         return len(self.mask)
 
+    def samples(self, step: float) -> float:
+        """How many samples, `step` apart, the integration ranges hold: what one iteration visits, but for what lies behind
+        an opaque surface."""
+        begin, end = self.ranges[1].double().sum(0).tolist()
+        return (end - begin) / step
+
 
 def gather_rays(
     capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March, backdrop: Tensor | None
