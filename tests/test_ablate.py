@@ -122,7 +122,7 @@ def test_a_finished_row_is_not_run_again(
     assert finished.run("--groups=terms") == 0
     assert started == []
     assert finished.run("--groups=terms", "seed=1") == 0
-    assert started == ["B = 0", "no mask loss"]
+    assert started == ["baseline", "no mask loss"]
 
 
 def test_a_row_that_failed_is_run_afresh(finished: Folders, tmp_path: Path) -> None:

@@ -69,7 +69,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(rows: Sequence[Row], scenes: Mapping[str, Path], out: Path, seconds: float) -> bool:
     """Run what is not finished, as long as another row is likely to end in time; False when interrupted."""
-    todo = list({row.key: row for row in rows if row.key and "scores" not in read_result(row, out)}.values())
+    unique: dict[Path, Row] = {}
+    for row in rows:
+        if row.key and "scores" not in read_result(row, out):
+            unique.setdefault(_folder(row, out), row)
+    todo = list(unique.values())
     start, longest = time.monotonic(), 0.0
     for number, row in enumerate(todo):
         begin = time.monotonic()
@@ -102,6 +106,7 @@ def run_row(row: Row, capture: Path, out: Path) -> dict[str, Any]:
         ["fit.py", *row.arguments, f"out={folder}"],
         ["evaluate.py", f"--run={folder}", *(f"{flag}={path}" for flag, path in truths)],
     )
+    # On Linux a child's peak memory begins at its parent's: this process loads nothing that a fit does not.
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "PYTHONUNBUFFERED": "1"}
     log = folder / "log.txt"
     result: dict[str, Any] = {"settings": row.arguments, "program": program_digest()}
