@@ -104,6 +104,7 @@ def test_history_has_a_row_per_iteration(finished: Path) -> None:
     assert {row["level"] for row in rows} == {"0.0", "1.0"}
     for level in ("0.0", "1.0"):
         losses = [float(row["loss"]) for row in rows if row["level"] == level]
+        assert all(float(row["samples"]) > VIEWS * SIZE for row in rows if row["level"] == level)
         assert losses[-1] < losses[0]
 
 

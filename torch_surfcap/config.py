@@ -80,6 +80,7 @@ class DescentConfig:
 @dataclass
 class CamerasConfig:
     skip: list[str] = field(default_factory=list)  # names or numbers of cameras to leave out
+    take: int = _within(0, 0)  # so many training cameras, evenly spread; 0: all
 
 
 @dataclass
@@ -145,6 +146,21 @@ def _to_config(merged: DictConfig, source: str) -> Config:
     assert isinstance(config, Config)
     _check(config, source)
     return config
+
+
+def capture_arguments(config: Config) -> dict[str, Any]:
+    """What `torch_surfcap.load_capture` takes of a config."""
+    data, cameras = config.data, config.cameras
+    return {
+        "path": data.path,
+        "format": data.format,
+        "scale": data.scale,
+        "holdout": data.holdout,
+        "masks": data.masks,
+        "plates": data.plates,
+        "skip": cameras.skip,
+        "take": cameras.take,
+    }
 
 
 def fit_arguments(config: Config) -> dict[str, Any]:

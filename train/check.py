@@ -67,11 +67,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         config = settings.load(None, ["out=out/check", *options.settings])
         config.data.path = options.data
-        data = config.data
-        capture = load_capture(
-            data.path, data.format, data.scale, data.holdout, data.masks, data.plates, config.cameras.skip
+        capture = load_capture(**settings.capture_arguments(config))
+        box = (
+            None if config.data.box is None else torch.tensor(config.data.box, dtype=torch.float64).view(2, 3)
         )
-        box = None if data.box is None else torch.tensor(data.box, dtype=torch.float64).reshape(2, 3)
         check = examine(capture, None if box is None else (box[0], box[1]))
         write(check, Path(config.out))
     except InputError as error:

@@ -170,16 +170,15 @@ def _concave(options: argparse.Namespace) -> Points | None:
 
 def _capture(config: settings.Config, protocol: str) -> Capture:
     """The run's views as the protocol reads them, with a line for each that is left out."""
-    data, skip = config.data, config.cameras.skip
-    if protocol == "default":
-        capture = load_capture(
-            data.path, data.format, data.scale, data.holdout, data.masks, data.plates, skip
-        )
-    else:
-        holdout = 0 if protocol == "nerf" else data.holdout
-        capture = load_capture(data.path, data.format, 1.0, holdout, True, False, skip)
+    arguments = settings.capture_arguments(config)
+    if protocol != "default":
+        arguments |= {"scale": 1.0, "masks": True, "plates": False}
+    if protocol == "nerf":
+        arguments["holdout"] = 0
+    capture = load_capture(**arguments)
     if protocol == "nerf" and capture.test is None:
-        raise InputError(f"{data.path}: no transforms_test.json, expected the test split of NeRF-synthetic")
+        path = config.data.path
+        raise InputError(f"{path}: no transforms_test.json, expected the test split of NeRF-synthetic")
     for warning in capture.warnings:
         print(f"warning: {warning}")
     return capture

@@ -163,15 +163,14 @@ def _check_same(path: Path, earlier: Config, config: Config) -> None:
 
 def _load(config: Config) -> Capture:
     """The capture, with a line that says what it is and one per warning."""
-    data = config.data
-    capture = load_capture(
-        data.path, data.format, data.scale, data.holdout, data.masks, data.plates, config.cameras.skip
-    )
+    capture = load_capture(**settings.capture_arguments(config))
     sizes = sorted({(int(w), int(h)) for w, h in capture.cameras.size})
     size = " to ".join(f"{w} x {h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
     held_out = f", {len(capture.test)} held out" if capture.test is not None else ""
     plates = ", with plates" if capture.plates is not None else ""
-    print(f"{data.path}: {len(capture)} views of {size}{held_out}, masks by {capture.mask_source}{plates}")
+    print(
+        f"{config.data.path}: {len(capture)} views of {size}{held_out}, masks by {capture.mask_source}{plates}"
+    )
     for warning in capture.warnings:
         print(f"warning: {warning}")
     sys.stdout.flush()

@@ -132,6 +132,17 @@ def test_holdout_and_skip(tmp_path: Path) -> None:
     assert capture.test.names == ["000", "004", "008"]
 
 
+def test_take_spreads_over_the_training_views(tmp_path: Path) -> None:
+    write_rig(tmp_path, rig_cameras(9))
+    capture = load_capture(tmp_path, holdout=4, skip=["002"], take=3)  # of 001, 003, 005, 006, 007
+    assert capture.names == ["001", "003", "006"]
+    assert capture.test is not None
+    assert capture.test.names == ["000", "004", "008"]
+    assert len(load_capture(tmp_path, take=9)) == 9
+    with pytest.raises(InputError, match=r"cameras to take: 10 of 9 training views, expected 0 \(all\) to 9"):
+        load_capture(tmp_path, take=10)
+
+
 def test_held_out_cameras_of_a_rig(tmp_path: Path) -> None:
     content = read_json(write_rig(tmp_path))
     content["cameras"][1]["held_out"] = True

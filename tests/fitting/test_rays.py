@@ -73,6 +73,14 @@ def test_every_ray_that_meets_the_surface_is_there(opacity: str) -> None:
         assert runs == len(block.unique())  # block by block
 
 
+def test_samples_are_counted_over_the_ranges() -> None:
+    """Ranges of 1 and 0.5, with samples 0.25 apart: 4 and 2."""
+    one = torch.zeros(2, 3)
+    ranges = (torch.tensor([0, 1, 2]), torch.tensor([[1.0, 2.0], [3.0, 3.5]]))
+    rays = RayBatch(one, one, one, one, one[:, 0], one[:, 0], ranges, [0, 2])
+    assert rays.samples(0.25) == 6
+
+
 def test_weights_do_not_depend_on_cameras_pixels_or_voxels() -> None:
     """A ray's weight is 1/(views * pixels of a voxel's face), so their sum over a face's pixels and views is 1."""
     capture = photographed(ring(4, side=[32, 64, 64, 48]))

@@ -14,7 +14,7 @@ from torch_surfcap.data.arrays import as_cameras, as_mask, as_picture, float_ten
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.checks import prepare
 from torch_surfcap.data.images import shrink
-from torch_surfcap.data.load import load_views, without
+from torch_surfcap.data.load import evenly, load_views, without
 from torch_surfcap.data.readers import read_views
 from torch_surfcap.data.view import View
 from torch_surfcap.errors import InputError
@@ -173,6 +173,7 @@ def load_capture(
     masks: bool = True,
     plates: bool = True,
     skip: Sequence[str | int] = (),
+    take: int = 0,
 ) -> Capture:
     """Read a capture; the result holds the training views, `.test` the held-out ones (or None).
 
@@ -184,6 +185,7 @@ def load_capture(
     masks:   read mask files and alpha; False: find silhouettes by plate or threshold
     plates:  read pictures of the empty room
     skip:    names or numbers of cameras to leave out
+    take:    so many of the training views that are left, evenly spread in the capture's order; 0 takes all
 
     Masks are never None afterwards. Cameras that see nothing useful are left out and named in `.warnings`.
     Raises InputError (one line: file, found, expected) for anything that cannot be used.
@@ -194,7 +196,8 @@ def load_capture(
         for view in views[::holdout]:
             view.held_out = True
     views = without(views, skip)
-    capture = _from_views([view for view in views if not view.held_out], scale, masks, plates)
+    training = evenly([view for view in views if not view.held_out], take)
+    capture = _from_views(training, scale, masks, plates)
     capture.format = format
     if holdout and named:
         capture.warnings.append(f"holdout={holdout} is ignored: the capture itself names its held-out views")

@@ -66,6 +66,17 @@ def without(views: list[View], skip: Sequence[str | int]) -> list[View]:
     return [view for i, view in enumerate(views) if i not in left_out]
 
 
+def evenly(views: list[View], take: int) -> list[View]:
+    """`take` of the views, as far apart in their order as can be; all for 0. Raises InputError where there are fewer."""
+    if not take:
+        return views
+    if not 0 < take <= len(views):
+        raise InputError(
+            f"cameras to take: {take} of {len(views)} training views, expected 0 (all) to {len(views)}"
+        )
+    return [views[i * len(views) // take] for i in range(take)]
+
+
 def load_views(views: list[View], scale: float, masks: bool, plates: bool) -> Loaded:
     """Read the pixels of all views. Raises InputError naming the first file that cannot be used."""
     if not 0 < scale <= 1:

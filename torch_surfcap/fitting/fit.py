@@ -115,7 +115,8 @@ def fit(
 
     while True:
         for row in descend(stage, studio, s):
-            so_far.history.append({"level": float(stage.number)} | row)
+            count = {"level": float(stage.number), "samples": stage.rays.samples(stage.march.step)}
+            so_far.history.append(count | row)
             report(Progress(stage.number, len(plan), stage.level, len(stage.store) * ops.TILE**3, row))
             if checkpoints is not None and checkpoints.due():
                 checkpoints.save(s, capture, box, stage, studio, so_far)

@@ -48,6 +48,12 @@ class RayBatch:
         """Which rays are camera i's."""
         return slice(self.camera_starts[i], self.camera_starts[i + 1])
 
+    def samples(self, step: float) -> float:
+        """How many samples, `step` apart, the integration ranges hold: what one iteration visits, but for what lies behind
+        an opaque surface."""
+        begin, end = self.ranges[1].double().sum(0).tolist()
+        return (end - begin) / step
+
     def expose(self, capture: Capture, backdrop: Tensor | None, exposure: Exposure) -> None:
         """Sets target and background in the common exposure.
 
