@@ -25,14 +25,12 @@ from numpy.typing import NDArray
 from torch_surfcap import config as settings
 from torch_surfcap import report
 from torch_surfcap.data.capture import Capture, load_capture
-from torch_surfcap.distance import SurfaceDistance
 from torch_surfcap.errors import InputError
-from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.metrics import surface_scores
+from torch_surfcap.run import read_mesh, read_run
 
 Points = NDArray[np.float64]
 
-ERROR_SCALE = 0.1  # of the cut: distance at the dark end of the error mesh's colours
 ERROR_VIEWS = 4
 
 
@@ -67,34 +65,13 @@ def evaluate(options: argparse.Namespace) -> dict[str, Any]:
     results["triangles"] = len(mesh.faces)
     results["seconds"] = time.perf_counter() - start
     if truth is not None:
-        distance = SurfaceDistance(truth)(np.asarray(mesh.vertices), options.cut).distance
-        painted = report.error_mesh(mesh, distance, ERROR_SCALE * options.cut)
+        painted, top = report.errors_of(mesh, truth, options.cut)
         report.write_mesh(run / "error.ply", painted)
         shown = report.some_views(len(capture), ERROR_VIEWS)
-        report.write_errors(run / "error.png", painted, capture.cameras, shown, ERROR_SCALE * options.cut)
+        report.write_errors(run / "error.png", painted, capture.cameras, shown, top)
     report.write_json(run / "evaluation.json", results)
     _print(results)
     return results
-
-
-def read_run(run: Path) -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]:
-    """Config, field and mesh of a finished run. Raises InputError naming the file that is missing or damaged."""
-    for name in ("config.yaml", "field.npz", "mesh.ply"):
-        if not (run / name).is_file():
-            raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
-    config = settings.load(run / "config.yaml")
-    return config, SurfaceField.load(run / "field.npz"), read_mesh(run / "mesh.ply")
-
-
-def read_mesh(path: Path) -> trimesh.Trimesh:
-    """A triangle mesh. Raises InputError naming the file where it is missing, damaged or without triangles."""
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
-        raise InputError(f"{path}: {error}, expected a triangle mesh") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"{path}: no triangles, expected a triangle mesh")
-    return mesh
 
 
 def read_points(path: Path) -> Points:
@@ -106,7 +83,7 @@ def read_points(path: Path) -> Points:
                 points = file["points" if "points" in names or len(names) != 1 else names[0]]
         else:
             points = np.asarray(getattr(trimesh.load(path, process=False), "vertices", ()))
-    except Exception as error:  # as in read_mesh
+    except Exception as error:  # trimesh's readers raise whatever their parsing trips over
         raise InputError(f"{path}: {error}, expected points") from error
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
         raise InputError(f"{path}: an array of shape {list(points.shape)}, expected finite points [P, 3]")

@@ -17,6 +17,7 @@ os.environ["THP_MEM_ALLOC_ENABLE"] = os.environ.get("THP_MEM_ALLOC_ENABLE", "1")
 
 import argparse
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -41,7 +42,7 @@ EVALUATED = (
     "evaluation.json",
     "error.ply",
     "error.png",
-)  # by evaluate.py; they go with the results they are of
+)  # by evaluate.py; they, and the pictures of render.py, go with the results they are of
 FREE_KEYS = {"out", "device", "overwrite", "resume"}  # may differ between a run and its resumption
 SHOWN = {"psnr_volume": "PSNR volume", "psnr_raster": "PSNR raster", "psnr_masked": "PSNR masked"}
 
@@ -208,6 +209,7 @@ def _write(
             report.write_json(aside / "metrics.json", metrics)
             for name in EVALUATED:
                 (out / name).unlink(missing_ok=True)
+            shutil.rmtree(out / report.PICTURES, ignore_errors=True)
             for name in RESULTS:
                 os.replace(aside / name, out / name)
     except OSError as error:

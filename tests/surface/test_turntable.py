@@ -80,6 +80,6 @@ def around(angles: list[float], elevation: float, roll: float = 0.0) -> Cameras:
     ],
 )
 def test_up_direction(angles: list[float], elevation: float, roll: float, degrees: float) -> None:
-    found = up_direction(around(angles, elevation, roll))
+    found = up_direction(around(angles, elevation, roll).world_to_camera)
     assert float(found.norm()) == pytest.approx(1.0)
     assert math.degrees(math.acos(min(1.0, float(found @ UP)))) <= degrees

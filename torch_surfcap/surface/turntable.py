@@ -19,15 +19,15 @@ SLIM = 0.5  # least width for a height, and least height for a width
 LEVEL = 1e-3  # mean square of a level camera's roll in radians, roughly
 
 
-def up_direction(cameras: Cameras) -> Tensor:
-    """Unit vector [3], world: up for people who held the cameras level.
+def up_direction(world_to_camera: Tensor) -> Tensor:
+    """Unit vector [3], world: up for people who held the cameras [N, 4, 4] level.
 
     The mean u_0 of the pictures' own upward directions leans backward where the cameras look down from one side. A
     level camera's x axis is horizontal, so what u_0 has along directions in which the x axes x_i spread is taken away:
     u ~ (mean x_i x_i^T + LEVEL)^-1 u_0, which stays near u_0 where there are too few cameras to tell.
     """
-    right, down = cameras.world_to_camera[:, 0, :3], cameras.world_to_camera[:, 1, :3]
-    spread = right.T @ right / len(cameras) + LEVEL * torch.eye(3, dtype=torch.float64)
+    right, down = world_to_camera[:, 0, :3], world_to_camera[:, 1, :3]
+    spread = right.T @ right / len(right) + LEVEL * torch.eye(3, dtype=torch.float64)
     return normalize(torch.linalg.solve(spread, -down.mean(0)), dim=0)
 
 
