@@ -138,7 +138,7 @@ def _write_views(
             path = out / f"{stem}_{kind}.png"
             written.append(path)
             if kind == "error":
-                report.write_error_pictures(path, [picture], top, picture.shape[0])
+                report.write_error_pictures(path, [picture], top, max(report.CELL, picture.shape[0]))
             else:
                 report.write_picture(path, picture)
         if "depth" in kinds:

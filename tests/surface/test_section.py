@@ -11,12 +11,10 @@ from tests.surface.shapes import CENTER, RADIUS, VOXEL, ball, ball_distance, fie
 from torch_surfcap.field.field import SLOPE, SurfaceField
 from torch_surfcap.surface.section import INSIDE_COLOR, OUTSIDE_COLOR, cut, middle_plane
 
-LEFT, TOP = 4, 4  # pixels of the margin of one tile
-
 
 @pytest.fixture(scope="module")
 def tiles() -> SurfaceField:
-    """3 x 3 x 3 tiles of edge 2 from (10, 20, 30): along x a stored one of transparency 0.5, an inside and an outside one."""
+    """3 x 3 x 3 tiles of edge 2 from (10, 20, 30): along x one stored (transparency 0.5), one inside, one outside."""
     values = torch.ones(12, 12, 12)
     values[:4], values[4:8] = 0.5, 0.01
     return SurfaceField.from_dense(values, torch.zeros(12, 12, 12, 3), [10.0, 20.0, 30.0], 0.5)
