@@ -133,7 +133,7 @@ def test_turntable(folder: Path, gone: bool, tmp_path: Path, capsys: pytest.Capt
 def test_section(folder: Path) -> None:
     (name,) = rendered(folder, "--section", f"z={CENTER[2]}", "--size", "300")
     assert name == f"section_z_{CENTER[2]:.4g}"
-    (name,) = rendered(folder, "--section", "y", "--size", "300")
+    (name,) = rendered(folder, "--what", "section", "--section", "y", "--size", "300")
     assert float(name.removeprefix("section_y_")) == pytest.approx(CENTER[1], abs=VOXEL / 2)
 
 

@@ -16,10 +16,11 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
 from difflib import get_close_matches
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -41,6 +42,8 @@ from torch_surfcap.run import read_mesh, read_run
 from torch_surfcap.surface.render import mesh_depth
 from torch_surfcap.surface.section import middle_plane
 from torch_surfcap.surface.turntable import turntable, up_direction
+
+Item = TypeVar("Item")
 
 USUAL = ("volume", "raster", "shaded", "normals", "depth", "constant", "view_dependent")
 TURNED = ("raster", "shaded")  # what a turntable shows where nothing else is asked for
@@ -132,7 +135,7 @@ def _write_views(
 ) -> list[Path]:
     """All kinds of pictures from all cameras."""
     written = []
-    for i, name in enumerate(tqdm(names, desc="views")):
+    for i, name in enumerate(_progress(names, "views")):
         stem, depths = re.sub(r"[^\w.=-]+", "_", name), subject.depth_range(cameras.subset([i]))
         for kind, picture in subject.pictures(kinds, cameras, i, depths, samples).items():
             path = out / f"{stem}_{kind}.png"
@@ -154,11 +157,16 @@ def _write_films(subject: Subject, kinds: list[str], cameras: Cameras, samples: 
     paths = [out / f"turntable_{kind}{suffix}" for kind in kinds]
     with ExitStack() as films:
         add = [films.enter_context(write_film(path, (width, height))) for path in paths]
-        for i in tqdm(range(len(cameras)), desc="turntable"):
+        for i in _progress(range(len(cameras)), "turntable"):
             frames = subject.pictures(kinds, cameras, i, depths, samples)
             for add_frame, kind in zip(add, kinds, strict=True):
                 add_frame(frames[kind])
     return paths
+
+
+def _progress(items: Collection[Item], what: str) -> Iterable[Item]:
+    """The items, with a bar; a log gets its beginning and end only."""
+    return tqdm(items, desc=what, mininterval=0.2 if sys.stderr.isatty() else 3600.0)
 
 
 def _kinds(options: argparse.Namespace, sh_degree: int) -> list[str]:
@@ -169,7 +177,7 @@ def _kinds(options: argparse.Namespace, sh_degree: int) -> list[str]:
         kinds = [kind for kind in usual if sh_degree or kind != "view_dependent"]
         kinds += ["section"] * (options.section is not None or not special)
         return kinds + ["error"] * (options.mesh_truth is not None)
-    kinds = list(dict.fromkeys(options.what.split(",")))
+    kinds = list(dict.fromkeys([*options.what.split(","), *["section"] * (options.section is not None)]))
     for kind in kinds:
         if kind not in (*KINDS, "section"):
             raise InputError(f"--what: no kind {kind!r}, expected of {', '.join(KINDS)}, section")

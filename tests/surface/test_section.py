@@ -94,6 +94,8 @@ def test_middle_plane_is_across_the_thinnest_side() -> None:
     body, arm = trimesh.creation.box((4, 1, 6)), trimesh.creation.icosphere(1, 0.1)
     body = body.subdivide().subdivide()
     arm.apply_translation([0, 2.5, 0])
-    axis, position = middle_plane(trimesh.util.concatenate([body, arm]))
+    both = trimesh.util.concatenate([body, arm])
+    assert isinstance(both, trimesh.Trimesh)
+    axis, position = middle_plane(both)
     assert axis == 1
     assert abs(position) <= 0.5  # within the body, whatever the arm

@@ -59,27 +59,36 @@ def test_cameras_go_around_upright(statue: trimesh.Trimesh) -> None:
         assert len(cast(statue, cameras, i).pixel) > 0
 
 
-def around(angles: list[float], elevation: float, roll: float = 0.0) -> Cameras:
-    """Cameras that look at the origin from these angles (degrees) about UP, rolled to and fro."""
+def around(angles: list[float], elevation: float, rolls: tuple[float, float] = (0.0, 0.0)) -> Cameras:
+    """Cameras that look at the origin from these angles about UP, rolled by turns by one of two angles; degrees."""
     ring = turntable(trimesh.creation.icosphere(2), UP, 360, elevation, size=64)
     chosen = ring.subset([round(a) % 360 for a in angles])
     for k, pose in enumerate(chosen.world_to_camera):
-        turn = math.radians(roll if k % 2 else -roll)
+        turn = math.radians(rolls[k % 2])
         rolled = torch.tensor([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
         pose[:2] = rolled.double() @ pose[:2]
     return chosen
 
 
 @pytest.mark.parametrize(
-    ("angles", "elevation", "roll", "degrees"),
+    ("angles", "elevation", "rolls", "degrees"),
     [
-        ([0, 90, 180, 270], 30.0, 0.0, 1e-6),
-        ([-30, -15, 0, 15, 30], 40.0, 0.0, 2.0),  # from one side, from above: the pictures' mean leans by 40
-        ([0, 45, 90, 135, 180, 225], 20.0, 3.0, 2.0),
-        ([10], 10.0, 0.0, 10.001),  # one camera knows no better than its picture
+        ([0, 90, 180, 270], 30.0, (0.0, 0.0), 1e-6),
+        (
+            [-30, -15, 0, 15, 30],
+            40.0,
+            (0.0, 0.0),
+            2.0,
+        ),  # from one side, from above: the pictures' mean leans by 40
+        ([0, 45, 90, 135, 180, 225], 20.0, (-3.0, 3.0), 2.0),
+        ([0, 60, 120, 180, 240, 300], 10.0, (90.0, 90.0), 1e-6),  # all on one side, or on the other
+        ([0, 60, 120, 180, 240, 300], 10.0, (-87.0, -93.0), 2.0),
+        ([10], 10.0, (0.0, 0.0), 10.001),  # one camera knows no better than its picture
     ],
 )
-def test_up_direction(angles: list[float], elevation: float, roll: float, degrees: float) -> None:
-    found = up_direction(around(angles, elevation, roll).world_to_camera)
+def test_up_direction(
+    angles: list[float], elevation: float, rolls: tuple[float, float], degrees: float
+) -> None:
+    found = up_direction(around(angles, elevation, rolls).world_to_camera)
     assert float(found.norm()) == pytest.approx(1.0)
     assert math.degrees(math.acos(min(1.0, float(found @ UP)))) <= degrees

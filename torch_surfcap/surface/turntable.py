@@ -16,19 +16,31 @@ from torch_surfcap.data.cameras import Cameras
 AWAY = 4.0  # distance of the cameras from the middle, in radii of the mesh: a long lens
 MARGIN = 0.05  # of the longer side, left free on all sides
 SLIM = 0.5  # least width for a height, and least height for a width
+SIDEWAYS = 0.05  # lead in flatness that the y axes need to be taken for the horizontal ones
 LEVEL = 1e-3  # mean square of a level camera's roll in radians, roughly
 
 
 def up_direction(world_to_camera: Tensor) -> Tensor:
-    """Unit vector [3], world: up for people who held the cameras [N, 4, 4] level.
+    """Unit vector [3], world: up for people who held the cameras [N, 4, 4] level, upright or on their sides.
 
     The mean u_0 of the pictures' own upward directions leans backward where the cameras look down from one side. A
     level camera's x axis is horizontal, so what u_0 has along directions in which the x axes x_i spread is taken away:
-    u ~ (mean x_i x_i^T + LEVEL)^-1 u_0, which stays near u_0 where there are too few cameras to tell.
+    u ~ (mean x_i x_i^T + LEVEL)^-1 u_0, which stays near u_0 where there are too few cameras to tell. Of cameras on their
+    sides the y axes are horizontal and spread in a plane; which end of their x axes is up is told by most looking down.
     """
-    right, down = world_to_camera[:, 0, :3], world_to_camera[:, 1, :3]
-    spread = right.T @ right / len(right) + LEVEL * torch.eye(3, dtype=torch.float64)
-    return normalize(torch.linalg.solve(spread, -down.mean(0)), dim=0)
+    right, down, forward = world_to_camera[:, :3, :3].double().unbind(1)
+    level, up = right, -down.mean(0)
+    if _flatness(down) > 2 * _flatness(right) + SIDEWAYS:
+        level, up = down, right.mean(0)
+        up = -up if up @ forward.mean(0) > 0 else up
+    spread = level.T @ level / len(level) + LEVEL * torch.eye(3, dtype=torch.float64)
+    return normalize(torch.linalg.solve(spread, up), dim=0)
+
+
+def _flatness(directions: Tensor) -> float:
+    """1/2 for unit vectors [N, 3] all around in one plane; 0 where they are parallel or in all directions alike."""
+    least, middle, _ = torch.linalg.eigvalsh(directions.T @ directions / len(directions))
+    return float(middle - least)
 
 
 def turntable(
