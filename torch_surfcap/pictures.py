@@ -35,8 +35,8 @@ KINDS = {
     "depth": "near red to far blue",
     "constant": "the constant colour β_00 alone, at the mesh",
     "view_dependent": "the view-dependent colour alone, around mid grey, at the mesh",
-    "constant_volume": "the same along rays",
-    "view_dependent_volume": "the same along rays",
+    "constant_volume": "the constant colour alone, along rays",
+    "view_dependent_volume": "the view-dependent colour alone, along rays",
     "error": "the mesh coloured by its distance to the true surface, green beyond the cut",
 }
 
@@ -60,7 +60,7 @@ class Subject:
     def depth_range(self, cameras: Cameras) -> tuple[float, float]:
         """Least and greatest depth of the mesh's vertices in any of the cameras, world units."""
         vertices = torch.from_numpy(np.asarray(self.mesh.vertices, dtype=np.float64))
-        depths = [cameras.project(i, vertices)[1] for i in range(len(cameras))]
+        depths = [vertices @ pose[2, :3] + pose[2, 3] for pose in cameras.world_to_camera]
         return min(float(d.min()) for d in depths), max(float(d.max()) for d in depths)
 
     def pictures(

@@ -34,7 +34,6 @@ from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.data.readers import read_views
 from torch_surfcap.errors import InputError
-from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.figures import write_section
 from torch_surfcap.movie import film_suffix, write_film
 from torch_surfcap.pictures import KINDS, Subject
@@ -77,7 +76,7 @@ def render(options: argparse.Namespace) -> list[Path]:
     config, field, mesh = read_run(run)
     kinds = _kinds(options, field.sh_degree)
     _check_numbers(options)
-    plane, poses = _section(options.section, mesh), _poses(config)
+    (axis, position), poses = _section(options.section, mesh), _poses(config)
     up = _up(options.up, poses)
     shown = [kind for kind in kinds if kind != "section"]
     still = shown and (options.view or not options.turntable)
@@ -87,7 +86,9 @@ def render(options: argparse.Namespace) -> list[Path]:
         subject.errors, top = report.errors_of(mesh, read_mesh(Path(options.mesh_truth)), options.cut)
     out, written = run / report.PICTURES, []
     if "section" in kinds:
-        written.append(_write_section(field, mesh, plane, options.size, up, config.mesh.threshold, out))
+        written.append(out / f"section_{'xyz'[axis]}_{position:.4g}.png")
+        size = options.size or SECTION_SIZE
+        write_section(written[-1], field, axis, position, size, up, config.mesh.threshold)
     if views is not None:
         names, cameras = views
         cameras = cameras if options.size is None else cameras.scaled_to(options.size)
@@ -96,32 +97,11 @@ def render(options: argparse.Namespace) -> list[Path]:
         if up is None:
             print("turntable: the capture's calibration is gone and --up not given, z is taken to be up")
             up = torch.tensor(AXES["z"])
-        front = None if poses is None else torch.linalg.inv(poses[0])[:3, 3]
+        front = None if poses is None else -poses[0, :3, :3].T @ poses[0, :3, 3]
         size = options.size or TURNTABLE_SIZE
         cameras = turntable(mesh, up, options.turntable, options.elevation, size, front)
         written += _write_films(subject, shown, cameras, options.samples, out)
     return written
-
-
-def _write_section(
-    field: SurfaceField,
-    mesh: trimesh.Trimesh,
-    plane: tuple[int, float],
-    size: int | None,
-    up: Tensor | None,
-    level: float | None,
-    out: Path,
-) -> Path:
-    axis, position = plane
-    path = out / f"section_{'xyz'[axis]}_{position:.4g}.png"
-    try:
-        write_section(path, field, axis, position, size or SECTION_SIZE, up, level)
-    except InputError:
-        raise
-    except ValueError as error:
-        low, high = mesh.bounds[:, axis]
-        raise InputError(f"--section: {error}, expected one from {low:.4g} to {high:.4g}") from error
-    return path
 
 
 def _write_views(
@@ -256,23 +236,26 @@ def _section(given: str | None, mesh: trimesh.Trimesh) -> tuple[int, float]:
     """Axis and position of "y=0.1"; the middle of "y"; where most is to be seen if nothing is given."""
     if given is None:
         return middle_plane(mesh)
-    axis, _, position = given.partition("=")
+    name, equals, position = given.partition("=")
     try:
-        number = "xyz".index(axis) if len(axis) == 1 else int("")
-        place = float(position) if "=" in given else float(np.median(mesh.vertices[:, number]))
+        axis = [*AXES].index(name)
+        place = float(position) if equals else float(np.median(mesh.vertices[:, axis]))
         if not math.isfinite(place):
             raise ValueError
     except ValueError:
         raise InputError(f"--section is {given!r}, expected x, y or z, or one such as y=0.1") from None
-    return number, place
+    return axis, place
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    kinds = {**KINDS, "section": "a plane through the field with its tiles and the level set"}
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="kinds:\n" + "\n".join(f"  {kind:<22}{meaning}" for kind, meaning in kinds.items()),
     )
     parser.add_argument("--run", required=True, metavar="OUT", help="folder of a finished fit")
-    parser.add_argument("--what", metavar="KIND,...", help=f"of {', '.join(KINDS)}, section")
+    parser.add_argument("--what", metavar="KIND,...", help="which pictures, of the kinds below")
     parser.add_argument(
         "--view", nargs="+", metavar="VIEW", help="names, numbers, train or test; a few by default"
     )

@@ -11,6 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_surfcap.errors import InputError
 from torch_surfcap.ops import INSIDE, OUTSIDE, TILE
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def cut(
     world units, instead of all stored tiles.
 
     Raises:
-        ValueError: no tile of the field is on the plane.
+        InputError: no tile of the field is on the plane.
     """
     table, edge = field.table.cpu(), TILE * field.voxel_size
     frame = np.array(field.frame[:3])
@@ -107,7 +108,9 @@ def cut(
         layer = layer.T
     occupied = (layer > OUTSIDE).nonzero()
     if len(occupied) == 0:
-        raise ValueError(f"no tile of the field at {'xyz'[axis]}={position:g}")
+        reach = frame[axis] + edge * np.flatnonzero((table > OUTSIDE).transpose(0, axis).flatten(1).any(1))
+        there = f"{reach[0]:.4g} to {reach[-1] + edge:.4g}" if len(reach) else "a field that is not empty"
+        raise InputError(f"section: no tile of the field at {'xyz'[axis]}={position:g}, expected {there}")
     if around is None:
         first, last = (x.double().numpy() for x in (occupied.amin(0) - 1, occupied.amax(0) + 2))
         low, span = frame[[across, upward]] + edge * first, edge * (last - first)
