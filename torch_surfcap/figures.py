@@ -87,6 +87,7 @@ def _draw(axes: Any, section: Section, line: float) -> None:
         rows, columns = value.shape
         at = u + (np.arange(columns) + 0.5) * du, v + (np.arange(rows) + 0.5) * dv
         axes.contour(*at, value, [section.level], colors=SURFACE, linewidths=4 * line)
+    axes.locator_params(nbins=6)
     axes.set(
         xlabel="xyz"[section.across], ylabel="xyz"[section.upward], xlim=(left, right), ylim=(bottom, top)
     )

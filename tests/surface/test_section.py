@@ -58,6 +58,8 @@ def test_orientation(
     assert (section.across, section.upward) == axes
     assert section.extent == pytest.approx(extent)
     assert section.picture()[inside].tolist() == pytest.approx(INSIDE_COLOR)
+    corners = [[{0: 10, 1: y}[axis] for axis in axes] for y in (20, 22, 24)]
+    assert sorted(section.stored.tolist()) == corners
 
 
 @pytest.mark.parametrize("position", [29.9, 36.1, 100, -100])
