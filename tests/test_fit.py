@@ -185,6 +185,8 @@ def test_earlier_results_are_kept(
     assert f"{out / 'config.yaml'}: losses.mask is 0.3 there and 0.7 now" in error
     (out / "evaluation.json").write_text("{}")
     (out / "notes.txt").write_text("mine")
+    (out / "pictures").mkdir()
+    (out / "pictures" / "turntable_raster.mp4").write_bytes(b"of the earlier mesh")
     old = (out / "metrics.json").read_bytes()
     assert run(scene, out, "overwrite=true", "seed=1") == 0
     assert (out / "metrics.json").read_bytes() != old

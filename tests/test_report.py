@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.surface.shapes import CENTER, ball
+from tests.surface.shapes import CENTER, ball, half_of
 from torch_surfcap import report
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.field import SurfaceField
@@ -149,3 +149,31 @@ def test_error_mesh_and_picture(field: SurfaceField, mesh: trimesh.Trimesh, tmp_
     assert isinstance(again.visual, trimesh.visual.ColorVisuals)
     assert (np.asarray(again.visual.vertex_colors) == colors).all()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["error.ply", "error.png"]
+
+
+def test_depth_in_16_bits(field: SurfaceField, mesh: trimesh.Trimesh, tmp_path: Path) -> None:
+    cameras = capture_of(field, mesh, False).cameras
+    # 7 / 65535 = 1.07e-4: the next power of ten is 1e-3.
+    depth = torch.tensor([[7.0, 1.2344], [torch.nan, 0.0012]])
+    report.write_depth(tmp_path / "depth.png", depth, cameras, 1)
+    found = cv2.imread(str(tmp_path / "depth.png"), cv2.IMREAD_UNCHANGED)
+    assert found is not None
+    assert found.dtype == np.uint16
+    assert found.tolist() == [[7000, 1234], [0, 1]]
+    beside = json.loads((tmp_path / "depth.json").read_text())
+    assert beside["depth_unit"] == 1e-3
+    assert beside["K"] == cameras.K[1].tolist()
+    assert beside["world_to_camera"] == cameras.world_to_camera[1].tolist()
+    assert beside["size"] == [WIDTH, HEIGHT]
+    report.write_depth(tmp_path / "depth.png", torch.full((2, 2), torch.nan), cameras, 1)
+    assert np.count_nonzero(np.asarray(cv2.imread(str(tmp_path / "depth.png"), cv2.IMREAD_UNCHANGED))) == 0
+
+
+def test_errors_against_the_truth(mesh: trimesh.Trimesh) -> None:
+    # The truth is the upper half alone: green below, nearly white above.
+    painted, top = report.errors_of(mesh, half_of(mesh, 2), 0.05)
+    assert top == pytest.approx(0.05 * report.ERROR_SCALE)
+    assert isinstance(painted.visual, trimesh.visual.ColorVisuals)
+    colors, height = np.asarray(painted.visual.vertex_colors), mesh.vertices[:, 2] - CENTER[2]
+    assert (colors[height > 0.02, :3] >= 240).all()
+    assert (colors[height < -0.08] == report.BEYOND).all()

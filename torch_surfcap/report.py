@@ -19,6 +19,7 @@ from torch import Tensor
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.files import atomic_write
+from torch_surfcap.distance import SurfaceDistance
 from torch_surfcap.metrics import psnr, ssim
 from torch_surfcap.surface.render import cast, colored, mesh_mask, raster, shaded, volume
 
@@ -28,10 +29,13 @@ if TYPE_CHECKING:
 Path = str | os.PathLike[str]
 
 CELL = 420  # largest height of a picture in a preview, pixels
+DPI = 110  # of figures with letters
+PICTURES = "pictures"  # folder, within a run's, of the files of render.py
 SCORED = 8  # views scored during a fit; evaluate.py scores all
 PREVIEWED = 4
 COLUMNS = ("photograph", "volume", "raster", "geometry")
 BEYOND = np.array([40, 170, 60, 255], dtype=np.uint8)  # green: farther from the truth than counts
+ERROR_SCALE = 0.1  # of the cut: distance at the dark end of the error mesh's colours
 ERRORS = "Reds"  # colour map of the errors, without any green
 
 
@@ -150,10 +154,26 @@ def _cell(picture: Tensor) -> NDArray[np.float32]:
 
 def write_picture(path: Path, picture: Tensor) -> None:
     """8-bit PNG of [H, W, 3] in [0, 1] (clipped)."""
-    pixels = np.rint(picture.clamp(0, 1).numpy() * 255).astype(np.uint8)
-    encoded = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1]
+    encoded = cv2.imencode(".png", cv2.cvtColor(as_bytes(picture), cv2.COLOR_RGB2BGR))[1]
     with atomic_write(path) as partial:
         partial.write_bytes(encoded.tobytes())
+
+
+def as_bytes(picture: Tensor) -> NDArray[np.uint8]:
+    """8-bit [H, W, 3] of [0, 1] (clipped)."""
+    return np.rint(picture.clamp(0, 1).numpy() * 255).astype(np.uint8)
+
+
+def write_depth(path: Path, depth: Tensor, cameras: Cameras, i: int) -> None:
+    """16-bit PNG of a depth [H, W] (world units, NaN: nothing there) seen by camera i, in units of the power of ten that
+    the largest one needs; 0 is nothing. Beside it, as JSON, that unit and the camera: K, world_to_camera, size."""
+    far = float(depth.nan_to_num(0.0).max())
+    unit = 10.0 ** math.ceil(math.log10(far / 65535)) if far > 0 else 1.0
+    pixels = np.rint(depth.nan_to_num(0.0).numpy().astype(np.float64) / unit).astype(np.uint16)
+    camera = {"K": cameras.K[i], "world_to_camera": cameras.world_to_camera[i], "size": cameras.size[i]}
+    with atomic_write(path) as partial:
+        partial.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+    write_json(os.path.splitext(path)[0] + ".json", {"depth_unit": unit, **camera})
 
 
 def write_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
@@ -190,6 +210,14 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def errors_of(mesh: trimesh.Trimesh, truth: trimesh.Trimesh, cut: float) -> tuple[trimesh.Trimesh, float]:
+    """The mesh coloured by its vertices' distances to the true surface (`error_mesh`), and the distance (world units) at
+    the dark end of the colours; green beyond `cut`."""
+    distance = SurfaceDistance(truth)(np.asarray(mesh.vertices), cut).distance
+    top = ERROR_SCALE * cut
+    return error_mesh(mesh, distance, top), top
+
+
 def error_mesh(mesh: trimesh.Trimesh, distance: NDArray[np.float64], top: float) -> trimesh.Trimesh:
     """The mesh with its vertices' distances [V] to the truth as colours: white 0, dark red `top` and more (world
     units), green where infinite, which stands for beyond the cut."""
@@ -206,20 +234,27 @@ def write_errors(
     path: Path, mesh: trimesh.Trimesh, cameras: Cameras, views: Sequence[int], top: float
 ) -> None:
     """PNG of a mesh of `error_mesh` from some cameras, with its scale."""
+    write_error_pictures(path, [colored(mesh, cameras, i) for i in views], top, CELL)
+
+
+def write_error_pictures(path: Path, pictures: Sequence[Tensor], top: float, height: int) -> None:
+    """PNG of pictures [H, W, 3] of a mesh of `error_mesh` side by side, `height` pixels high, with their scale."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(3.2 * len(views) + 1.2, 4.2), layout="constrained")
+    shapes = [picture.shape[1] / picture.shape[0] for picture in pictures]
+    inches = height / DPI
+    figure = Figure(figsize=(sum(shapes) * inches + 1.2, inches), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(1, len(views), squeeze=False)[0]
-    for axis, i in zip(axes, views, strict=True):
-        axis.imshow(colored(mesh, cameras, i).clamp(0, 1).numpy())
+    axes = figure.subplots(1, len(pictures), squeeze=False, width_ratios=shapes)[0]
+    for axis, picture in zip(axes, pictures, strict=True):
+        axis.imshow(picture.clamp(0, 1).numpy())
         axis.set_axis_off()
     scale = ScalarMappable(Normalize(0, top), ERRORS)
     figure.colorbar(
         scale, ax=list(axes), label="distance to the true surface (green: beyond the cut)", extend="max"
     )
     with atomic_write(path) as partial:
-        figure.savefig(partial, dpi=110)
+        figure.savefig(partial)

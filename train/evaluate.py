@@ -26,7 +26,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import trimesh
 
 from torch_surfcap import config as settings
@@ -34,13 +33,11 @@ from torch_surfcap import report
 from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.data.geometry import Points, read_mesh, read_points
 from torch_surfcap.data.parse import read_json
-from torch_surfcap.distance import SurfaceDistance
 from torch_surfcap.errors import InputError
-from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.metrics import surface_scores
 from torch_surfcap.protocols import dtu, table
+from torch_surfcap.run import read_run
 
-ERROR_SCALE = 0.1  # of the cut: distance at the dark end of the error mesh's colours
 ERROR_VIEWS = 4
 FILES = ("config.yaml", "field.npz", "mesh.ply")  # of a finished run, without which it cannot be scored
 
@@ -115,11 +112,10 @@ def _score(run: Path, scan: dtu.Scan | None, options: argparse.Namespace) -> dic
     results["fit"] = _cost(run)
     results["seconds"] = time.perf_counter() - start
     if truth is not None:
-        distance = SurfaceDistance(truth)(np.asarray(mesh.vertices), options.cut).distance
-        painted = report.error_mesh(mesh, distance, ERROR_SCALE * options.cut)
+        painted, top = report.errors_of(mesh, truth, options.cut)
         report.write_mesh(run / "error.ply", painted)
         shown = report.some_views(len(capture), ERROR_VIEWS)
-        report.write_errors(run / "error.png", painted, capture.cameras, shown, ERROR_SCALE * options.cut)
+        report.write_errors(run / "error.png", painted, capture.cameras, shown, top)
     return results
 
 
@@ -151,12 +147,6 @@ def _cost(run: Path) -> dict[str, Any]:
         return {"seconds": metrics["seconds"]["total"], "peak_memory_bytes": metrics["peak_memory_bytes"]}
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: no {error}, expected the metrics.json of a fit") from error
-
-
-def read_run(run: Path) -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]:
-    """Config, field and mesh of a finished run. Raises InputError naming the file that is damaged."""
-    config = settings.load(run / "config.yaml")
-    return config, SurfaceField.load(run / "field.npz"), read_mesh(run / "mesh.ply")
 
 
 def _concave(options: argparse.Namespace) -> Points | None:

@@ -18,6 +18,7 @@ os.environ["THP_MEM_ALLOC_ENABLE"] = os.environ.get("THP_MEM_ALLOC_ENABLE", "1")
 
 import argparse
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -43,7 +44,7 @@ EVALUATED = (
     "evaluation.json",
     "error.ply",
     "error.png",
-)  # by evaluate.py; they go with the results they are of
+)  # by evaluate.py; they, and the pictures of render.py, go with the results they are of
 CHECKPOINT = "checkpoint.npz"
 # May differ between a run and its resumption.
 FREE_KEYS = {"out", "device", "overwrite", "resume", "checkpoint"}
@@ -223,6 +224,7 @@ def _write(
             report.write_json(aside / "metrics.json", metrics)
             for name in EVALUATED:
                 (out / name).unlink(missing_ok=True)
+            shutil.rmtree(out / report.PICTURES, ignore_errors=True)
             for name in RESULTS:
                 os.replace(aside / name, out / name)
             (out / CHECKPOINT).unlink(missing_ok=True)

@@ -63,6 +63,18 @@ def test_subset_keeps_the_order() -> None:
     assert len(cameras.subset([])) == 0
 
 
+def test_joined_and_scaled() -> None:
+    cameras = rig_cameras()
+    both = Cameras.joined([cameras.subset([4]), cameras.subset([0, 1])])
+    torch.testing.assert_close(both.centers, cameras.centers[[4, 0, 1]])
+    # A picture of 300 x 200 at 60 x 40: a fifth, and so every pixel position.
+    large = Cameras(cameras.K[:1], cameras.world_to_camera[:1], torch.tensor([[300, 200]]))
+    small = large.scaled_to(60)
+    assert small.size.tolist() == [[60, 40]]
+    point = torch.tensor([[0.1, 0.2, 0.3]])
+    torch.testing.assert_close(small.project(0, point)[0], large.project(0, point)[0] / 5)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

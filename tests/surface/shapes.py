@@ -48,3 +48,9 @@ def colors_of(mesh: trimesh.Trimesh) -> np.ndarray:
     """[V, 3] vertex colours in [0, 1]."""
     assert isinstance(mesh.visual, trimesh.visual.ColorVisuals)
     return np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0
+
+
+def half_of(mesh: trimesh.Trimesh, axis: int) -> trimesh.Trimesh:
+    """The faces of a mesh on the side of CENTER on which x, y or z (0, 1, 2) is greater."""
+    faces = mesh.faces[mesh.triangles_center[:, axis] > CENTER[axis]]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)

@@ -12,11 +12,13 @@ from torch_surfcap.surface.extract import extract_mesh
 from torch_surfcap.surface.render import (
     GREY,
     cast,
+    constant_part,
     mesh_depth,
     mesh_mask,
     mesh_normals,
     raster,
     shaded,
+    view_dependent_part,
     volume,
     window,
 )
@@ -52,12 +54,13 @@ def mesh(field: SurfaceField) -> trimesh.Trimesh:
 
 
 def expected_depth(cameras: Cameras, i: int) -> np.ndarray:
-    """[H, W] distance along the rays to the true ball, NaN beside it."""
+    """[H, W] depth along the optical axis of the true ball, NaN beside it."""
     origins, directions = (x.numpy() for x in cameras.rays(i))
+    forward = cameras.world_to_camera[i, 2, :3].numpy()
     middle = ((CENTER - origins) * directions).sum(axis=1)
     off = RADIUS**2 - (((CENTER - origins) ** 2).sum(axis=1) - middle**2)
     with np.errstate(invalid="ignore"):
-        return np.asarray(middle - np.sqrt(off)).reshape(HEIGHT, WIDTH)
+        return np.asarray((middle - np.sqrt(off)) * (directions @ forward)).reshape(HEIGHT, WIDTH)
 
 
 @pytest.mark.parametrize("i", [0, 1])
@@ -72,11 +75,13 @@ def test_mask_and_depth(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> None
 
 
 def test_shading_and_normals(mesh: trimesh.Trimesh, cameras: Cameras) -> None:
-    # In the middle the ball faces the camera: full light, and the normal is -z of the camera.
+    # In the middle the ball faces the camera: full light, and the normal points at it. To the left of and above the
+    # middle it points there as well: less red, more green.
     light, normals = shaded(mesh, cameras, 1), mesh_normals(mesh, cameras, 1)
     row, column = HEIGHT // 2, WIDTH // 2
     assert light[row, column].tolist() == pytest.approx([GREY] * 3, abs=0.03)
-    assert normals[row, column].tolist() == pytest.approx([0.5, 0.5, 0.0], abs=0.1)
+    assert normals[row, column].tolist() == pytest.approx([0.5, 0.5, 1.0], abs=0.1)
+    assert normals[row, column - 6, 0] < 0.3 < 0.7 < normals[row - 6, column, 1]
     assert light[0, 0].tolist() == normals[0, 0].tolist() == [1, 1, 1]
     assert light[row, column - 9, 0] < light[row, column, 0] - 0.1
 
@@ -103,6 +108,24 @@ def test_raster_takes_the_direction_of_the_ray(cameras: Cameras) -> None:
     field = SurfaceField.from_dense(values, sh, torch.from_numpy(origin), VOXEL, opacity="distance")
     picture = raster(field, extract_mesh(field), cameras, 1, WHITE)
     assert picture[HEIGHT // 2, WIDTH // 2].tolist() == pytest.approx([0.9, 0.5, 0.5], abs=1e-3)
+
+
+def test_parts_of_the_colour(cameras: Cameras) -> None:
+    # 0.5 + 0.4 x in red seen along +x: constant 0.5, view-dependent 0.4 above mid grey.
+    origin, _, distance = ball_distance()
+    sh = torch.zeros(*distance.shape, 4, 3)
+    sh[..., 0, :], sh[..., 3, 0] = torch.tensor([0.5, 0.3, 0.1]), 0.4
+    values = torch.from_numpy(signed(distance)).float()
+    field = SurfaceField.from_dense(values, sh, torch.from_numpy(origin), VOXEL, opacity="distance")
+    before, mesh, middle = field.voxels.detach().clone(), extract_mesh(field), (HEIGHT // 2, WIDTH // 2)
+    for part, color in (
+        (constant_part(field), [0.5, 0.3, 0.1]),
+        (view_dependent_part(field), [0.5 + 0.4, 0.5, 0.5]),
+    ):
+        onto, through = raster(part, mesh, cameras, 1, WHITE), volume(part, cameras, 1, WHITE)
+        assert onto[middle].tolist() == pytest.approx(color, abs=1e-3)
+        assert through[middle].tolist() == pytest.approx(color, abs=0.02)
+    assert torch.equal(field.voxels, before)
 
 
 def test_volume_equals_raster_where_the_field_is_solid(

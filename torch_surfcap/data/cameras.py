@@ -131,10 +131,22 @@ class Cameras:
         index = torch.as_tensor(indices, dtype=torch.int64).reshape(-1)
         return Cameras(self.K[index], self.world_to_camera[index], self.size[index])
 
+    @classmethod
+    def joined(cls, parts: Sequence[Cameras]) -> Cameras:
+        """All cameras of the parts, in order."""
+        return cls(
+            *(torch.cat([getattr(p, name) for p in parts]) for name in ("K", "world_to_camera", "size"))
+        )
+
     def resized(self, factors: Tensor, size: Tensor) -> Cameras:
         """The cameras of images scaled by `factors` [N,2] (x, y) to `size` [N,2]."""
         scale = torch.cat([factors.to(torch.float64), torch.ones(len(self), 1, dtype=torch.float64)], dim=1)
         return Cameras(self.K * scale[:, :, None], self.world_to_camera, size)
+
+    def scaled_to(self, longer: int) -> Cameras:
+        """The cameras of pictures with `longer` pixels on their longer side and, but for rounding, the same proportions."""
+        size = (self.size * longer / self.size.amax(dim=1, keepdim=True)).round().long().clamp(min=1)
+        return self.resized(size / self.size, size)
 
     def scaled_half(self) -> Cameras:
         """The cameras of the 2x2 means: K/2, size // 2 (an odd last row or column is dropped)."""

@@ -26,6 +26,7 @@ Background = float | Sequence[float] | Tensor
 
 CHUNK = 1 << 16  # rays or points handed to the field at a time
 GREY = 0.85  # albedo of the shaded geometry
+MID_GREY = 0.5  # colour on which the view-dependent part is shown
 
 
 @dataclass
@@ -129,6 +130,18 @@ def volume(field: SurfaceField, cameras: Cameras, i: int, background: Background
     return out.reshape(height, width, 3)
 
 
+def constant_part(field: SurfaceField) -> SurfaceField:
+    """The field with its constant colour β_00 alone: what does not depend on the direction of view."""
+    return type(field)(field.voxels.detach()[..., :4], field.grid, field.opacity)
+
+
+def view_dependent_part(field: SurfaceField) -> SurfaceField:
+    """The field with mid grey in place of β_00: what depends on the direction of view, brighter or darker than that."""
+    voxels = field.voxels.detach().clone()
+    voxels[..., 1:4] = MID_GREY
+    return type(field)(voxels, field.grid, field.opacity)
+
+
 def field_box(field: SurfaceField) -> tuple[Tensor, Tensor]:
     """Low and high corner [3] (float64, world units) of what the field can hold, with a voxel of margin for the
     interpolation."""
@@ -153,26 +166,32 @@ def mesh_mask(mesh: trimesh.Trimesh, cameras: Cameras, i: int, hits: Hits | None
     return hits.picture(torch.ones(len(hits.pixel), 1), torch.zeros(hits.size[0] * hits.size[1], 1))[:, :, 0]
 
 
-def mesh_depth(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Tensor:
-    """[H, W]: distance from the camera's centre along the ray, world units; NaN where nothing is hit."""
-    hits = cast(mesh, cameras, i)
+def mesh_depth(mesh: trimesh.Trimesh, cameras: Cameras, i: int, hits: Hits | None = None) -> Tensor:
+    """[H, W]: depth along the optical axis, world units; NaN where nothing is hit."""
+    hits = cast(mesh, cameras, i) if hits is None else hits
+    forward, offset = cameras.world_to_camera[i, 2, :3], cameras.world_to_camera[i, 2, 3]
+    depth = torch.from_numpy(hits.point) @ forward + offset
     empty = torch.full((hits.size[0] * hits.size[1], 1), torch.nan)
-    return hits.picture(torch.from_numpy(hits.distance)[:, None], empty)[:, :, 0]
+    return hits.picture(depth[:, None], empty)[:, :, 0]
 
 
-def mesh_normals(mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background = 1.0) -> Tensor:
-    """[H, W, 3]: face normals in the camera's axes (x right, y down, z forward) as colours, -1..1 to 0..1."""
-    hits = cast(mesh, cameras, i)
-    turn = cameras.world_to_camera[i, :3, :3]
-    normals = torch.from_numpy(_normals(mesh, hits)) @ turn.T
+def mesh_normals(
+    mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background = 1.0, hits: Hits | None = None
+) -> Tensor:
+    """[H, W, 3]: face normals as normal maps show them, -1..1 to 0..1: red right, green up, blue towards the camera."""
+    hits = cast(mesh, cameras, i) if hits is None else hits
+    right, down, forward = cameras.world_to_camera[i, :3, :3]
+    normals = torch.from_numpy(_normals(mesh, hits)) @ torch.stack([right, -down, -forward], dim=1)
     return hits.picture(0.5 + 0.5 * normals, backdrop(background, hits.size))
 
 
-def colored(mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background = 1.0) -> Tensor:
+def colored(
+    mesh: trimesh.Trimesh, cameras: Cameras, i: int, background: Background = 1.0, hits: Hits | None = None
+) -> Tensor:
     """[H, W, 3]: the mesh's own vertex colours, interpolated within the faces, under a lamp at the camera."""
     if not isinstance(mesh.visual, trimesh.visual.ColorVisuals):
         raise ValueError("a mesh with vertex colours is needed")
-    hits = cast(mesh, cameras, i)
+    hits = cast(mesh, cameras, i) if hits is None else hits
     faces = np.asarray(mesh.faces)[hits.face]
     weights = trimesh.triangles.points_to_barycentric(np.asarray(mesh.vertices)[faces], hits.point)
     colors = np.asarray(mesh.visual.vertex_colors)[faces, :3] / 255.0

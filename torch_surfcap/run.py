@@ -1,0 +1,21 @@
+"""A finished run, read back from the folder that train/fit.py wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import trimesh
+
+from torch_surfcap import config as settings
+from torch_surfcap.data.geometry import read_mesh
+from torch_surfcap.errors import InputError
+from torch_surfcap.field.field import SurfaceField
+
+
+def read_run(run: Path) -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]:
+    """Config, field and mesh of a finished run. Raises InputError naming the file that is missing or damaged."""
+    for name in ("config.yaml", "field.npz", "mesh.ply"):
+        if not (run / name).is_file():
+            raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
+    config = settings.load(run / "config.yaml")
+    return config, SurfaceField.load(run / "field.npz"), read_mesh(run / "mesh.ply")
