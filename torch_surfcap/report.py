@@ -20,8 +20,10 @@ from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.distance import SurfaceDistance
+from torch_surfcap.fitting.color_gain import Equations, Exposure
+from torch_surfcap.fitting.rays import WITHIN
 from torch_surfcap.metrics import psnr, ssim
-from torch_surfcap.surface.render import cast, colored, mesh_mask, raster, shaded, volume
+from torch_surfcap.surface.render import Hits, cast, colored, light, mesh_mask, raster, shaded
 
 if TYPE_CHECKING:
     from torch_surfcap.field.field import SurfaceField
@@ -62,19 +64,54 @@ def scene_photograph(capture: Capture, i: int, background: float | Sequence[floa
     return mask * photograph + (1 - mask) * scene_background(capture, i, background)
 
 
+def rendered(
+    field: SurfaceField,
+    mesh: trimesh.Trimesh,
+    capture: Capture,
+    i: int,
+    background: float | Sequence[float] = 1.0,
+    gains: bool = False,
+) -> tuple[Tensor, Tensor, Hits]:
+    """Volume and raster picture [H, W, 3] of view i, as its camera would have taken them, and what it sees of the mesh.
+
+    gains: the field is in the exposure that all cameras were brought to; this camera's own one is fitted to its
+    photograph (which is all that a held-out camera's exposure can be known by) and given to the pictures.
+    """
+    behind = scene_background(capture, i, background)
+    hits = cast(mesh, capture.cameras, i)
+    color, through = light(field, capture.cameras, i)
+    onto = raster(field, mesh, capture.cameras, i, behind, hits)
+    if gains:
+        exposure = own_exposure(capture, i, color, through)
+        color = exposure.own(0, color.view(-1, 3), 1 - through.flatten()).view(color.shape)
+        at = torch.from_numpy(hits.pixel)
+        onto.view(-1, 3)[at] = exposure.own(0, onto.view(-1, 3)[at], torch.ones(len(at)))
+    return color + through[:, :, None] * behind, onto, hits
+
+
+def own_exposure(capture: Capture, i: int, color: Tensor, through: Tensor) -> Exposure:
+    """Gain and bias of view i by the field's part [H, W, 3] and transmittance [H, W] of its rays."""
+    photograph, color, through = capture.photograph(i).view(-1, 3), color.view(-1, 3), through.flatten()
+    if capture.plates is not None:
+        return Equations.of(photograph, color, through, capture.plate(i).view(-1, 3)).solve(gauge=False)
+    within = torch.ones_like(through, dtype=torch.bool)
+    if capture.masks is not None:
+        within = capture.masks[i].flatten() > WITHIN
+    return Equations.of(photograph[within], color[within], through[within]).solve(gauge=False)
+
+
 def score_view(
     field: SurfaceField,
     mesh: trimesh.Trimesh,
     capture: Capture,
     i: int,
     background: float | Sequence[float] = 1.0,
+    gains: bool = False,
 ) -> dict[str, float]:
-    """Scores of one view: psnr_volume, psnr_raster, ssim (volume) over the full frame; psnr_masked,
-    psnr_raster_masked where the mask is over 0.5; silhouette_iou of the mesh against that mask."""
-    truth, behind = scene_photograph(capture, i, background), scene_background(capture, i, background)
-    through = volume(field, capture.cameras, i, behind)
-    hits = cast(mesh, capture.cameras, i)
-    onto = raster(field, mesh, capture.cameras, i, behind, hits)
+    """Scores of one view, in the photograph's own exposure (see `rendered`): psnr_volume, psnr_raster, ssim (volume) over
+    the full frame; psnr_masked, psnr_raster_masked where the mask is over 0.5; silhouette_iou of the mesh against it."""
+    truth = scene_photograph(capture, i, background)
+    through, onto, hits = rendered(field, mesh, capture, i, background, gains)
     scores = {
         "psnr_volume": psnr(through, truth),
         "psnr_raster": psnr(onto, truth),
@@ -95,10 +132,11 @@ def score_views(
     capture: Capture,
     views: Iterable[int] | None = None,
     background: float | Sequence[float] = 1.0,
+    gains: bool = False,
 ) -> dict[str, float]:
     """Means over views (all if None) of `score_view`, and their number as "views"."""
     each = [
-        score_view(field, mesh, capture, i, background)
+        score_view(field, mesh, capture, i, background, gains)
         for i in (range(len(capture)) if views is None else views)
     ]
     return mean_scores(each)
@@ -120,15 +158,16 @@ def write_preview(
     capture: Capture,
     views: Sequence[int] | None = None,
     background: float | Sequence[float] = 1.0,
+    gains: bool = False,
 ) -> None:
     """PNG with a row per view (a few spread ones if None): photograph, volume, raster, shaded geometry."""
     rows = []
     for i in some_views(len(capture), PREVIEWED) if views is None else views:
-        behind, hits = scene_background(capture, i, background), cast(mesh, capture.cameras, i)
+        through, onto, hits = rendered(field, mesh, capture, i, background, gains)
         pictures = [
             scene_photograph(capture, i, background),
-            volume(field, capture.cameras, i, behind),
-            raster(field, mesh, capture.cameras, i, behind, hits),
+            through,
+            onto,
             shaded(mesh, capture.cameras, i, hits=hits),
         ]
         rows.append(np.concatenate([_cell(p) for p in pictures], axis=1))

@@ -8,6 +8,7 @@ import trimesh
 
 from torch_surfcap import config as settings
 from torch_surfcap.data.geometry import read_mesh
+from torch_surfcap.data.parse import read_json
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
 
@@ -19,3 +20,10 @@ def read_run(run: Path) -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]
             raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
     config = settings.load(run / "config.yaml")
     return config, SurfaceField.load(run / "field.npz"), read_mesh(run / "mesh.ply")
+
+
+def gains_fitted(run: Path) -> bool:
+    """Whether a finished run brought its cameras to a common exposure, by its metrics.json; False without one."""
+    path = run / "metrics.json"
+    chosen = read_json(path).get("chosen", {}) if path.is_file() else {}
+    return isinstance(chosen, dict) and chosen.get("gains", {}).get("value") == "on"

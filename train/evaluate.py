@@ -36,7 +36,7 @@ from torch_surfcap.data.parse import read_json
 from torch_surfcap.errors import InputError
 from torch_surfcap.metrics import surface_scores
 from torch_surfcap.protocols import dtu, table
-from torch_surfcap.run import read_run
+from torch_surfcap.run import gains_fitted, read_run
 
 ERROR_VIEWS = 4
 FILES = ("config.yaml", "field.npz", "mesh.ply")  # of a finished run, without which it cannot be scored
@@ -103,10 +103,11 @@ def _score(run: Path, scan: dtu.Scan | None, options: argparse.Namespace) -> dic
         results["surface"] = _scan_scores(mesh, scan, capture, options)
     elif truth is not None or points is not None or concave is not None:
         results["surface"] = surface_scores(mesh, truth, points, concave, options.cut, options.cut / 5)
+    gains = gains_fitted(run)
     splits = {"test": capture.test, "train": capture if options.train or scan is not None else None}
     for name, views in splits.items():
         if views is not None:
-            each = [report.score_view(field, mesh, views, i) for i in range(len(views))]
+            each = [report.score_view(field, mesh, views, i, gains=gains) for i in range(len(views))]
             results[name] = {**report.mean_scores(each), "each": dict(zip(views.names, each, strict=True))}
     results["triangles"] = len(mesh.faces)
     results["fit"] = _cost(run)

@@ -185,7 +185,7 @@ def _metrics(result: FitResult, capture: Capture, seconds: dict[str, Any]) -> di
     for split, views in (("train", capture), ("test", capture.test)):
         if views is not None:
             chosen = report.some_views(len(views), report.SCORED)
-            scores[split] = report.score_views(result.field, result.mesh, views, chosen)
+            scores[split] = report.score_views(result.field, result.mesh, views, chosen, gains=result.gains)
     seconds["score"] = time.perf_counter() - begin
     return {
         **scores,
@@ -215,7 +215,9 @@ def _write(
             report.write_mesh(aside / "mesh.glb", result.mesh)
             result.field.save(aside / "field.npz")
             settings.save(config, aside / "config.yaml")
-            report.write_preview(aside / "preview.png", result.field, result.mesh, capture)
+            report.write_preview(
+                aside / "preview.png", result.field, result.mesh, capture, gains=result.gains
+            )
             report.write_history(aside / "history.csv", result.history)
             now = time.perf_counter()
             metrics["seconds"] |= {"total": now - start, "write": now - begin}

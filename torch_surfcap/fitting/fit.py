@@ -46,6 +46,11 @@ class FitResult:
     resumed_from: list[int] | None = None
     iterations_run: int = 0
 
+    @property
+    def gains(self) -> bool:
+        """Whether the cameras were brought to a common exposure."""
+        return bool(self.chosen["gains"]["value"] == "on")
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -182,5 +187,12 @@ def _chosen(
             "value": "on" if studio.gains else "off",
             "spread": studio.spread,
             "reason": "found at the coarsest level" if s.gains == "auto" else "given",
+            "cameras": {
+                name: {"gain": gain.tolist(), "bias": bias.tolist()}
+                for name, gain, bias in zip(
+                    studio.pictures[0].names, studio.exposure.gain, studio.exposure.bias, strict=True
+                )
+                if studio.gains
+            },
         },
     }

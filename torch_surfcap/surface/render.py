@@ -119,15 +119,22 @@ def raster(
     return hits.picture(colors, backdrop(background, hits.size))
 
 
-def volume(field: SurfaceField, cameras: Cameras, i: int, background: Background) -> Tensor:
-    """[H, W, 3]: the integral of the field along each pixel's ray, marched where the field's box can be seen."""
+def light(field: SurfaceField, cameras: Cameras, i: int) -> tuple[Tensor, Tensor]:
+    """The field's own part of each pixel's ray, colour [H, W, 3], and the transmittance [H, W] that is left for what lies
+    behind; marched where the field's box can be seen."""
     width, height = (int(s) for s in cameras.size[i])
-    out = backdrop(background, (height, width))
+    color, through = torch.zeros(height * width, 3), torch.ones(height * width)
     with torch.no_grad():
         for pixels in window(cameras, i, *field_box(field)).split(CHUNK):
-            origins, directions = pixel_rays(cameras, i, pixels)
-            out[pixels] = field(origins, directions, background=out[pixels]).color.cpu().float()
-    return out.reshape(height, width, 3)
+            seen = field(*pixel_rays(cameras, i, pixels))
+            color[pixels], through[pixels] = seen.color.cpu().float(), seen.transmittance.cpu().float()
+    return color.reshape(height, width, 3), through.reshape(height, width)
+
+
+def volume(field: SurfaceField, cameras: Cameras, i: int, background: Background) -> Tensor:
+    """[H, W, 3]: the integral of the field along each pixel's ray."""
+    color, through = light(field, cameras, i)
+    return color + through[:, :, None] * backdrop(background, through.shape).reshape(color.shape)
 
 
 def constant_part(field: SurfaceField) -> SurfaceField:
@@ -204,7 +211,7 @@ def _normals(mesh: trimesh.Trimesh, hits: Hits) -> Array:
     return face_normals(np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)[hits.face]])
 
 
-def backdrop(background: Background, size: tuple[int, int]) -> Tensor:
+def backdrop(background: Background, size: Sequence[int]) -> Tensor:
     """A background as a fresh [H*W, 3] float32 for a picture of (height, width)."""
     color = torch.as_tensor(background, dtype=torch.float32).cpu()
     if color.ndim == 3 and color.shape != (*size, 3):
