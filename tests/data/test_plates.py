@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tests.data.rigs import HEIGHT, WIDTH, disc, rig_cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import prepare
-from torch_surfcap.data.plates import exposed_alike, separate
+from torch_surfcap.data.plates import exposure, separate
 
 Array = NDArray[np.float32]
 SIZE = (200, 160)
@@ -39,12 +39,12 @@ def shade() -> Array:
     drawn = np.zeros(SIZE[::-1], np.float32)
     cv2.ellipse(drawn, (112, 133), (48, 10), 4, 0, 360, 1.0, -1)
     soft = cv2.GaussianBlur(drawn, (0, 0), 2.0)
-    return (1 - soft[:, :, None] * np.float32([0.52, 0.54, 0.55])).astype(np.float32)
+    return (1 - soft[:, :, None] * np.array([0.52, 0.54, 0.55], np.float32)).astype(np.float32)
 
 
 def photograph(plate: Array, noise: float, seed: int = 1) -> Array:
     """[H,W,3] the figure and its shadow before the room, at another exposure."""
-    picture = np.where(figure()[:, :, None], np.float32([0.8, 0.3, 0.1]), shade() * plate)
+    picture = np.where(figure()[:, :, None], np.array([0.8, 0.3, 0.1], np.float32), shade() * plate)
     grain = noise * np.random.default_rng(seed).standard_normal(plate.shape)
     return np.clip(GAIN * picture + BIAS + grain, 0, 1).astype(np.float32)
 
@@ -59,7 +59,7 @@ def grown(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)) > 0
 
 
-@pytest.mark.parametrize(("noise", "jpeg"), [(0.0, False), (0.01, False), (0.01, True), (0.02, False)])
+@pytest.mark.parametrize(("noise", "jpeg"), [(0.003, False), (0.01, False), (0.01, True), (0.02, False)])
 def test_the_shadow_is_out_and_the_subject_is_in(noise: float, jpeg: bool) -> None:
     plate = room()
     pictures = [photograph(plate, noise), plate]
@@ -111,16 +111,17 @@ def test_half_a_picture_full_of_subject_does_not_set_the_exposure() -> None:
     plate = room()
     picture = GAIN * plate + BIAS
     picture[:, :90] = (0.9, 0.2, 0.15)
-    np.testing.assert_allclose(exposed_alike(picture, plate)[:, 90:], picture[:, 90:], atol=0.005)
+    gain, bias = exposure(picture, plate)
+    np.testing.assert_allclose(gain, GAIN, atol=0.005)
+    np.testing.assert_allclose(bias, BIAS, atol=0.003)
 
 
-def test_an_exposure_is_found_to_a_few_thousandths() -> None:
+def test_the_exposure_of_a_noisy_pair_with_subject_and_shadow() -> None:
     plate = room()
     noisy = plate + 0.02 * np.random.default_rng(2).standard_normal(plate.shape)
-    found = exposed_alike(photograph(plate, 0.02), noisy.astype(np.float32)) - exposed_alike(plate, plate)
-    expected = (GAIN - 1) * noisy + BIAS
-    lit = ~grown(figure(), 4) & (shade()[:, :, 1] > 0.999)
-    assert np.abs(found - (expected + noisy - plate))[lit].mean() < 0.006
+    gain, bias = exposure(photograph(plate, 0.02), noisy.astype(np.float32))
+    np.testing.assert_allclose(gain, GAIN, atol=0.015)
+    np.testing.assert_allclose(bias, BIAS, atol=0.01)
 
 
 def test_the_fit_gets_the_room_in_shadow_and_held_out_views_the_room() -> None:
@@ -131,7 +132,9 @@ def test_the_fit_gets_the_room_in_shadow_and_held_out_views_the_room() -> None:
     pictures = []
     for i in range(len(cameras)):
         subject = disc(cameras, i)[:, :, None] > 0
-        pictures.append(np.where(subject, np.uint8([250, 20, 10]), (shadow * plate).astype(np.uint8)))
+        pictures.append(
+            np.where(subject, np.array([250, 20, 10], np.uint8), (shadow * plate).astype(np.uint8))
+        )
     plates = [plate] * len(pictures)
     capture = Capture(pictures, cameras.K, cameras.world_to_camera, plates=plates)
     capture.test = Capture(pictures, cameras.K, cameras.world_to_camera, plates=plates)

@@ -10,8 +10,8 @@ import torch
 import trimesh
 
 from torch_surfcap.data.capture import load_capture
-from torch_surfcap.data.sample_scene import main, make_sample_scene
 from torch_surfcap.data.plates import separate
+from torch_surfcap.data.sample_scene import main, make_sample_scene
 from torch_surfcap.errors import InputError
 
 
