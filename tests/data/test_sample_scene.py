@@ -10,8 +10,8 @@ import torch
 import trimesh
 
 from torch_surfcap.data.capture import load_capture
+from torch_surfcap.data.plates import separate
 from torch_surfcap.data.sample_scene import main, make_sample_scene
-from torch_surfcap.data.silhouettes import plate_silhouette
 from torch_surfcap.errors import InputError
 
 
@@ -62,7 +62,7 @@ def test_plates_show_the_room_without_the_figure(folder: Path) -> None:
     for photograph, plate, mask in zip(capture.images, capture.plates, capture.masks, strict=True):
         outside = mask == 0
         assert torch.equal(photograph[outside], plate[outside])
-        found = torch.from_numpy(plate_silhouette(photograph.numpy(), plate.numpy())) > 0.5
+        found = torch.from_numpy(separate(photograph.numpy(), plate.numpy())[0]) > 0.5
         true = mask > 0.5
         sure = mask > 0.8
         assert (found & sure).sum() / sure.sum() > 0.98

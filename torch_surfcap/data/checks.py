@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torch_surfcap.data.load import in_threads
-from torch_surfcap.data.silhouettes import find_silhouette
+from torch_surfcap.data.plates import separate
+from torch_surfcap.data.silhouettes import black_silhouette
 from torch_surfcap.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,8 +23,10 @@ EMPTY, FULL = 1e-5, 0.995  # share of the picture that the subject covers in a m
 def prepare(capture: Capture) -> Capture:
     """The capture with silhouettes for every view and without the cameras that see nothing useful.
 
-    Each camera left out is named in `.warnings`; the held-out views are treated alike. A prepared capture is returned
-    as it is. Raises InputError where silhouettes cannot be found or fewer than 3 cameras remain.
+    Each camera left out is named in `.warnings`; the held-out views are treated alike. Where silhouettes are found by
+    plates, the plates of the views to fit become the room in the subject's shadow; held-out views are scored against
+    the room as it is. A prepared capture is returned as it is. Raises InputError where silhouettes cannot be found or
+    fewer than 3 cameras remain.
     """
     if capture.prepared:
         return capture
@@ -37,7 +40,7 @@ def prepare(capture: Capture) -> Capture:
             f"capture: {len(kept)} usable cameras of {len(capture)}{first}, expected at least {FEWEST}"
         )
     if test is not None:
-        test = _find_masks(test)
+        test = _find_masks(test, shadows=False)
         kept_test = _leave_out(test, _faults(test, subject=meeting_point(kept)))
         kept.warnings += [f"held out: {line}" for line in kept_test.warnings]
         kept_test.prepared = True
@@ -52,27 +55,34 @@ def _leave_out(capture: Capture, faults: dict[int, str]) -> Capture:
     return kept
 
 
-def _find_masks(capture: Capture) -> Capture:
-    """A copy with masks: found by plates, or by a black background, where the capture has none."""
+def _find_masks(capture: Capture, shadows: bool = True) -> Capture:
+    """A copy with masks: found by plates, or by a black background, where the capture has none.
+
+    With `shadows` plates that were needed for it become the room in the subject's shadow.
+    """
     found = capture.subset(range(len(capture)))
     if capture.masks is not None:
         return found
-
-    def silhouette(i: int) -> Tensor | None:
-        plate = None if capture.plates is None else capture.plates[i].numpy()
-        mask = find_silhouette(capture.images[i].numpy(), plate)
-        return None if mask is None else torch.from_numpy(mask)
-
-    masks = in_threads(silhouette, range(len(capture)))
+    photographs = [image.numpy() for image in capture.images]
+    if capture.plates is not None:
+        plates = [plate.numpy() for plate in capture.plates]
+        separated = in_threads(lambda pair: separate(*pair), zip(photographs, plates, strict=True))
+        found.masks, rooms = ([torch.from_numpy(x) for x in part] for part in zip(*separated, strict=True))
+        found.plates = rooms if shadows else found.plates
+        found.mask_source = "plate"
+        return found
+    masks = in_threads(black_silhouette, photographs)
     bright = [name for name, mask in zip(capture.names, masks, strict=True) if mask is None]
     if 2 * len(bright) > len(masks):
         raise InputError(
             f"capture: no masks, no alpha, no plates, and the background of {len(bright)} of {len(masks)} pictures "
             f"(first: {bright[0]}) is not black, expected one of these to tell the subject from the room"
         )
-    found.mask_source = "threshold" if capture.plates is None else "plate"
+    found.mask_source = "threshold"
     blank = [torch.zeros(image.shape[:2]) for image in capture.images]
-    found.masks = [none if mask is None else mask for mask, none in zip(masks, blank, strict=True)]
+    found.masks = [
+        none if mask is None else torch.from_numpy(mask) for mask, none in zip(masks, blank, strict=True)
+    ]
     return found
 
 
