@@ -182,7 +182,7 @@ def test_earlier_results_are_kept(
     assert error.startswith(f"out: {out} holds the results of an earlier run (mesh.ply)")
     assert "overwrite=true or resume=true" in error
     error = refused(scene, out, capsys, "resume=true", "losses.mask=0.7")
-    assert f"{out / 'config.yaml'}: losses.mask is 0.3 there and 0.7 now" in error
+    assert f"{out / 'config.yaml'}: losses.mask is None there and 0.7 now" in error
     (out / "evaluation.json").write_text("{}")
     (out / "notes.txt").write_text("mine")
     (out / "pictures").mkdir()

@@ -167,7 +167,7 @@ def test_a_checkpoint_is_kept_from_a_fresh_run(
     assert command.main(arguments) == 2
     assert "holds a checkpoint of an earlier run" in capsys.readouterr().err
     assert command.main([*arguments, "resume=true", "losses.mask=0.7"]) == 2
-    assert f"{kept}: losses.mask is 0.3 there and 0.7 now" in capsys.readouterr().err
+    assert f"{kept}: losses.mask is None there and 0.7 now" in capsys.readouterr().err
     assert command.main([*arguments, "resume=true"]) == 0
     assert "resumed at iteration" in capsys.readouterr().out
     assert sorted(p.name for p in out.iterdir()) == sorted(command.RESULTS)

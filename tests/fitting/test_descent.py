@@ -111,7 +111,7 @@ def run(opacity: str, iterations: int) -> tuple[Tensor, list[dict[str, float]]]:
     capture = ball(6, 32)
     box = subject_box(capture, None)
     plan = [replace(plan_levels(capture, box, 0.06, 1)[0], iterations=iterations)]
-    settings = FitSettings.of(opacity=opacity)
+    settings = FitSettings.of(opacity=opacity).suited(capture.mask_source)
     studio = open_studio(capture, settings, 0)
     stage = begin_stage(
         settings, plan, 0, *first_field(capture, box, plan[0].voxel_size, settings, 1), studio
@@ -133,7 +133,7 @@ def test_the_loss_falls_alike_on_any_threads(opacity: str, threads: None) -> Non
     assert len(rows) <= 18
     assert [row["iteration"] for row in rows] == list(range(len(rows)))
     assert rows[-1]["loss"] < 0.5 * rows[0]["loss"]
-    weights = FitSettings.of(opacity=opacity).losses
+    weights = FitSettings.of(opacity=opacity).suited("file").losses
     names = ("photo", "sample", "mask", "tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
     for row in rows:
         assert row["loss"] == pytest.approx(sum(getattr(weights, name) * row[name] for name in names))

@@ -95,6 +95,7 @@ def fit(
     seconds: dict[str, Any] = {}
     watch = Stopwatch(seconds)
     capture = prepare(capture)
+    s = s.suited(capture.mask_source)
     saved = None if checkpoints is None else checkpoints.load()
     if saved is not None and checkpoints is not None:
         checkpoints.check(saved, s, capture)
@@ -183,6 +184,7 @@ def _chosen(
             "value": [*box[0].tolist(), *box[1].tolist()],
             "reason": "silhouettes" if s.box is None else "given",
         },
+        "mask": {"value": s.losses.mask, "reason": f"silhouettes by {studio.pictures[0].mask_source}"},
         "gains": {
             "value": "on" if studio.gains else "off",
             "spread": studio.spread,

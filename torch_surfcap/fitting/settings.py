@@ -14,7 +14,9 @@ class Losses:
 
     photo: float = 1.0  # Huber(colour - photograph), eq. 8
     sample: float = 0.3  # each sample's own colour against the photograph, eq. 10
-    mask: float = 0.3  # (transmittance - (1 - mask))^2
+    mask: float | None = (
+        None  # (transmittance - (1 - mask))^2; by default what suits the silhouettes, see MASK
+    )
     huber: float = 0.1  # colour difference above which Huber's norm is linear
     tv_opacity: float = 3e-5  # squared steps of the opacity value, eq. 9
     tv_color: float = 1e-3  # squared steps of the colour coefficients
@@ -41,8 +43,12 @@ class Descent:
 
 LOSSES = {
     "distance": Losses(),
-    "transparency": Losses(sample=1.0, mask=0.1, tv_opacity=2e-4, ballooning=2e-5, curvature=0.0),
+    "transparency": Losses(sample=1.0, tv_opacity=2e-4, ballooning=2e-5, curvature=0.0),
 }
+# Weight of the mask loss. Silhouettes that were found by plates err where subject and room look alike, and with plates
+# the colours themselves say what is empty.
+MASK = {"distance": 0.3, "transparency": 0.1}
+MASK_BY_PLATES = 0.03
 DESCENT = {
     "distance": Descent(),
     "transparency": Descent(rate_opacity=0.06),
@@ -92,6 +98,13 @@ class FitSettings:
     specks: float = 0.01
     losses: Losses = field(default_factory=Losses)
     descent: Descent = field(default_factory=Descent)
+
+    def suited(self, mask_source: str | None) -> FitSettings:
+        """The settings with the mask's weight that suits where a capture's silhouettes are from."""
+        if self.losses.mask is not None:
+            return self
+        weight = MASK_BY_PLATES if mask_source == "plate" else MASK[self.opacity]
+        return replace(self, losses=replace(self.losses, mask=weight))
 
     @staticmethod
     def of(**given: Any) -> FitSettings:
