@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -106,12 +107,12 @@ def test_rates_and_bounds(degree: int, opacity: str) -> None:
         assert not store[..., count:].any()
 
 
-def run(opacity: str, iterations: int) -> tuple[Tensor, list[dict[str, float]]]:
+def run(opacity: str, iterations: int, **more: Any) -> tuple[Tensor, list[dict[str, float]]]:
     """A level of a small ball from its hull on."""
     capture = ball(6, 32)
     box = subject_box(capture, None)
     plan = [replace(plan_levels(capture, box, 0.06, 1)[0], iterations=iterations)]
-    settings = FitSettings.of(opacity=opacity).suited(capture.mask_source)
+    settings = FitSettings.of(opacity=opacity, **more).suited(capture.mask_source)
     studio = open_studio(capture, settings, 0)
     stage = begin_stage(
         settings, plan, 0, *first_field(capture, box, plan[0].voxel_size, settings, 1), studio
@@ -137,3 +138,15 @@ def test_the_loss_falls_alike_on_any_threads(opacity: str, threads: None) -> Non
     names = ("photo", "sample", "mask", "tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
     for row in rows:
         assert row["loss"] == pytest.approx(sum(getattr(weights, name) * row[name] for name in names))
+
+
+def test_ballooning_fades_with_the_rates() -> None:
+    """Annealed, its share of the loss is scaled as the rates are."""
+    losses = {"anneal": True, "ballooning": 1e-3}
+    rows = run("transparency", 12, losses=losses)[1]
+    names = ("photo", "sample", "mask", "tv_opacity", "tv_color", "parsimony", "curvature")
+    weights = FitSettings.of(opacity="transparency", losses=losses).suited("file").losses
+    assert {row["rate"] for row in rows} >= {1.0, 0.3}
+    for row in rows:
+        others = sum(getattr(weights, name) * row[name] for name in names)
+        assert row["loss"] - others == pytest.approx(1e-3 * row["rate"] * row["ballooning"], rel=1e-4)

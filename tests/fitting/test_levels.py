@@ -76,6 +76,35 @@ def test_first_field_holds_the_ball(opacity: str, degree: int) -> None:
     assert not store[..., 4:].any()
 
 
+def test_a_transparency_that_falls_off_from_the_hull() -> None:
+    """Clear at the hull's surface, and a fiftieth less for every voxel below it."""
+    capture, voxel = ball(), 0.03
+    settings = FitSettings.of(opacity="transparency", start="hull")
+    grid, store = first_field(capture, BOX, voxel, settings, 0)
+    field = SurfaceField(store, grid, "transparency")
+    depths = torch.tensor([0.0, 3.0, 6.0])[:, None] * voxel
+    along = torch.tensor([[RADIUS, 0.0, 0.0]]) - depths * torch.tensor([[1.0, 0.0, 0.0]])
+    value = field.sample_opacity(center + along)
+    assert (value.diff() < 0).all()
+    assert value[0] > 0.93
+    torch.testing.assert_close(value.diff(), torch.full((2,), -0.06), rtol=0.2, atol=0)
+    assert store[..., 0].max() == 1.0
+
+
+def test_upscaling_keeps_the_light_or_the_value() -> None:
+    """Between four voxels of a half, the next level has a half, or its root: twice as many voxels stop as much light."""
+    grid, store = fog_around_ball()
+    store[..., 0] = 0.5
+    march = March(0, SLOPE, 0.04, 1e-3)
+    for upscale, expected in (("plain", 0.5), ("sqrt", 0.5**0.5)):
+        settings = FitSettings.of(opacity="transparency", upscale=upscale)
+        _, values = next_level(
+            grid, store, settings, gather_rays(ball(side=32), store, grid, "transparency", march), march
+        )
+        middle = values[..., 0].flatten().median()
+        assert float(middle) == pytest.approx(expected)
+
+
 def test_a_box_of_too_many_voxels() -> None:
     """Refused before anything of that size is allocated."""
     with pytest.raises(

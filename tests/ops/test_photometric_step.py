@@ -63,6 +63,22 @@ def test_detached_sample_loss_moves_colors_only(device: str) -> None:
 
 
 @pytest.mark.parametrize("opacity", MODES)
+@pytest.mark.parametrize("detach", [False, True])
+def test_samples_against_the_rendered_colour(detach: bool, opacity: int, device: str) -> None:
+    """The rendered colour is a constant: the loss does not pull at it, and the target has no say."""
+    given = arguments("photometric_step", make_scene(opacity=opacity, device=device))
+    given[-3:-1] = [[0.0, 1.0, 0.0], detach]
+    actual = ops.photometric_step(*given, rendered_sample=True)
+    for one, other in zip(
+        actual, reference.photometric_step(*[*doubled(given), None, None, True]), strict=True
+    ):
+        assert_close(one, other)
+    given[7] = torch.rand_like(given[7])
+    assert torch.equal(ops.photometric_step(*given, rendered_sample=True)[1], actual[1])
+    assert not torch.equal(ops.photometric_step(*given)[1], actual[1])
+
+
+@pytest.mark.parametrize("opacity", MODES)
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_gradcheck(degree: int, opacity: int, device: str) -> None:
     scene = make_scene(degree, opacity, device=device, rays=12, side=2)
