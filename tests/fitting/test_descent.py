@@ -143,7 +143,7 @@ def test_the_loss_falls_alike_on_any_threads(opacity: str, threads: None) -> Non
 def test_ballooning_fades_with_the_rates() -> None:
     """Annealed, its share of the loss is scaled as the rates are."""
     losses = {"anneal": True, "ballooning": 1e-3}
-    rows = run("transparency", 12, losses=losses)[1]
+    rows = run("transparency", 40, losses=losses)[1]
     names = ("photo", "sample", "mask", "tv_opacity", "tv_color", "parsimony", "curvature")
     weights = FitSettings.of(opacity="transparency", losses=losses).suited("file").losses
     assert {row["rate"] for row in rows} >= {1.0, 0.3}
