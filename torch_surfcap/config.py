@@ -97,6 +97,8 @@ class Config:
     voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
     opacity: str | None = _one_of(None, *LOSSES)  # what a voxel stores
+    gradient: str = _one_of("scatter", "scatter", "gather")  # exact, or read by the voxels (paper, eq. 19)
+    lattice: int = _one_of(32, 32, 8)  # bits of a number of the samples' gradients that "gather" keeps
     losses: LossesConfig = field(default_factory=LossesConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
@@ -144,6 +146,8 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "levels": config.levels,
         "box": None if config.data.box is None else tuple(config.data.box),
         "seed": config.seed,
+        "gradient": config.gradient,
+        "lattice": config.lattice,
         "threshold": config.mesh.threshold,
         "smooth": config.mesh.smooth,
         "specks": config.mesh.specks,

@@ -15,6 +15,7 @@ from torch_surfcap.autograd import March
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
+from torch_surfcap.fitting.gathered import GatheredGradient
 from torch_surfcap.fitting.rays import RayBatch, find_ranges
 from torch_surfcap.fitting.settings import FitSettings
 
@@ -100,32 +101,34 @@ def descend(
     frame = grid.frame(*MISSING[settings.opacity])
     bundle = (rays.origins, rays.directions)
     seen = (rays.background, rays.target, rays.mask, rays.weight)
-    gradients = store.new_empty(gradient_groups(store.numel()), *store.shape)
+    gathered = GatheredGradient(rays, grid, settings, march) if settings.gradient == "gather" else None
+    groups = 0 if gathered else gradient_groups(store.numel())
+    gradients = store.new_empty(groups, *store.shape)
     adam = TileAdam(store, settings.opacity, settings.descent)
     rule = Plateau(limit=3 * iterations)
     watch = Stopwatch(seconds)
-    goes_on, moved = True, 0.0
+    goes_on, moved, compared = True, 0.0, 0.0
     while goes_on:
         if moved >= REFRESH:
             moved = 0.0
             rays.ranges = find_ranges(store, grid, settings.opacity, march, *bundle)
+            if gathered:
+                gathered.lay_out()
             watch.lap("ranges")
-        shift = (torch.rand(len(rays), generator=generator) - 0.5) * settings.descent.jitter
-        ray_losses, gradient, _, _ = ops.photometric_step(
-            store,
-            grid.table,
-            frame,
-            *bundle,
-            shift,
-            *seen,
-            **march._asdict(),
-            huber=loss.huber,
-            weights=ray_weights,
-            detach_sample=loss.detach_sample,
-            ranges=rays.ranges,
-            gradients=gradients,
-        )
-        watch.lap("march")
+        lattices = len(rays.cameras) if gathered else len(rays)
+        shift = (torch.rand(lattices, generator=generator) - 0.5) * settings.descent.jitter
+        lost = (*march, loss.huber, ray_weights, loss.detach_sample)
+        cosines: dict[str, float] = {}
+        if gathered:
+            step = (store, grid.table, frame, *bundle, gathered.per_ray(shift), *seen, *lost)
+            ray_losses, gradient = gathered.step(step, shift, watch)
+            if rule.scale != compared:
+                cosines, compared = gathered.cosines(step), rule.scale
+                watch.lap("compare")
+        else:
+            step = (store, grid.table, frame, *bundle, shift, *seen, *lost)
+            ray_losses, gradient, _, _ = ops.photometric_step(*step, ranges=rays.ranges, gradients=gradients)
+            watch.lap("march")
         voxel_losses = ops.voxel_terms(
             store, grid.table, frame, grid.places, voxel_weights, PARSIMONY_HUBER, BEND, gradient
         )
@@ -137,7 +140,7 @@ def descend(
         total = float(losses @ weights)
         row = {"iteration": float(rule.count), "loss": total, "rate": rule.scale}
         goes_on = rule.goes_on(total)
-        yield row | dict(zip(RAY_LOSSES + VOXEL_LOSSES, losses.tolist(), strict=True))
+        yield row | dict(zip(RAY_LOSSES + VOXEL_LOSSES, losses.tolist(), strict=True)) | cosines
 
 
 class Stopwatch:

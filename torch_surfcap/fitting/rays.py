@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torch_surfcap import ops
 from torch_surfcap.autograd import March
+from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.field.hull import grown
@@ -25,7 +26,7 @@ class RayBatch:
     """R rays and their observations, float32, in the order of cameras and pixel blocks.
 
     origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them;
-    camera_starts: [N + 1], where each camera's rays begin.
+    camera_starts: [N + 1], where each camera's rays begin; pixels: [R, 2] int32, column and row; cameras: of the pictures.
     """
 
     origins: Tensor
@@ -36,6 +37,8 @@ class RayBatch:
     weight: Tensor
     ranges: tuple[Tensor, Tensor]
     camera_starts: list[int]
+    pixels: Tensor
+    cameras: Cameras
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -84,16 +87,15 @@ def gather_rays(
             background = backdrop.expand_as(photograph)
             photograph = soft[:, None] * photograph + (1 - soft[:, None]) * background
         weight = torch.full_like(soft, 1.0 / (len(cameras) * float(pixels_per_voxel[i]) ** 2))
-        parts.append((origins, directions, photograph, background, soft, weight))
+        pixels = index.flip(1).to(torch.int32)
+        parts.append((origins, directions, photograph, background, soft, weight, pixels))
         counts.append(passes[hit])
         ranges.append(stretches)
         starts.append(starts[-1] + len(index))
     joined = [torch.cat(column).contiguous() for column in zip(*parts, strict=True)]
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
-    origins, directions, target, background, soft, weight = joined
-    return RayBatch(
-        origins, directions, target, background, soft, weight, (offsets, torch.cat(ranges)), starts
-    )
+    *seen, pixels = joined
+    return RayBatch(*seen, (offsets, torch.cat(ranges)), starts, pixels, cameras)
 
 
 def colorless(store: Tensor) -> Tensor:

@@ -55,6 +55,9 @@ class FitSettings:
     voxel:     edge of the finest voxels, world units; a pixel's footprint by default
     levels:    number of resolutions; by default as many, up to 4, as the pictures can be halved
     box:       (x0, y0, z0, x1, y1, z1) around the subject; found by default
+    gradient:  "scatter", the exact gradient of the ray terms, or "gather", the paper's eq. 19: close to it, and without
+               sums that threads share
+    lattice:   32 or 8, bits of a number of the samples' gradients that "gather" keeps
     threshold: opacity value of the surface. smooth: rounds of Taubin smoothing of the mesh. specks: pieces under this
                fraction of the largest one's area are removed
     losses, descent: see there; `losses=dict(mask=0.1)` changes one entry
@@ -67,6 +70,8 @@ class FitSettings:
     box: tuple[float, ...] | None = None
     seed: int = 0
     device: str = "cpu"
+    gradient: str = "scatter"
+    lattice: int = 32
     threshold: float | None = None
     smooth: int = 5
     specks: float = 0.01
@@ -94,6 +99,8 @@ class FitSettings:
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
             ("voxel", settings.voxel is None or settings.voxel > 0),
             ("levels", settings.levels is None or settings.levels >= 1),
+            ("gradient", settings.gradient in ("scatter", "gather")),
+            ("lattice", settings.lattice in (32, 8)),
         ):
             if not sound:
                 raise ValueError(
