@@ -21,7 +21,7 @@ from .rays import (
     photometric_step,
     visibility,
 )
-from .slots import gather_gradient, photometric_lattice
+from .slots import coded, gather_gradient, photometric_lattice
 from .store import INSIDE, OUTSIDE, TILE, corners, dense, nonempty_cells, sample_backward, sample_forward, upscale
 from .voxels import adam_step, huber_norm, soft_hull, voxel_terms
 
@@ -33,6 +33,7 @@ __all__ = [
     "TILE",
     "TRANSPARENCY",
     "adam_step",
+    "coded",
     "corners",
     "dense",
     "gather_gradient",
