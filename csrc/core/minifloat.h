@@ -33,7 +33,7 @@ SURFCAP_HD float decode_e5m2(uint8_t code) {
 
 // Four of them at once. They are the upper halves of 16-bit floats, which processors know.
 SURFCAP_HD Pack<float, 4> decode_e5m2(const uint8_t* codes) {
-#if defined(__F16C__) && !defined(__CUDACC__)
+#if defined(SURFCAP_F16C)
   int32_t four;
   __builtin_memcpy(&four, codes, sizeof(four));
   const __m128i halves = _mm_unpacklo_epi8(_mm_setzero_si128(), _mm_cvtsi32_si128(four));

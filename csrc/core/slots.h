@@ -11,6 +11,8 @@
 // the voxel times dL/dc, for a field of dL/dc that is smooth over voxels and samples.
 #pragma once
 
+#include <climits>
+
 #include "march.h"
 #include "minifloat.h"
 
@@ -50,6 +52,7 @@ template <class Real, class Slot> struct ToSlots {
 // Where the voxels of a tile stand on one camera's lattice, kLanes voxels at a time: what they read and how.
 template <class Real> struct Stand {
   const int32_t* corner[kLanes];                    // the upper left pixel's ray, in the camera's window
+  const int32_t* reach[kLanes];                     // of the rays around: least and one more than greatest k
   Real right[kLanes], down[kLanes], after[kLanes];  // place between this pixel and its neighbours, between two samples
   int32_t k[kLanes];                                // the sample before
   Real way[3][kLanes], distance[kLanes];            // from the camera's centre
@@ -88,6 +91,7 @@ SURFCAP_HD void find_stand(const Field<Real>& field, const int32_t* coordinate, 
   const Index column = along(h[0], window[0], width, out.right), row = along(h[1], window[1], height, out.down);
   const Number squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2];
   const Real filling = determinant * voxel * voxel * voxel / cameras.step;
+  const int64_t blocks = ((width - 1) >> kReachBits) + 1;
   for (int l = 0; l < kLanes; ++l) {
     const Real distance = std::sqrt(squared[l]), depth = h[2][l];
     const Real k = larger(distance / cameras.step - Real(0.5) - cameras.shift[v], Real(0));
@@ -96,6 +100,8 @@ SURFCAP_HD void find_stand(const Field<Real>& field, const int32_t* coordinate, 
     out.distance[l] = distance;
     out.samples[l] = depth > Real(0) ? filling * distance / (depth * depth * depth) : Real(0);
     out.corner[l] = cameras.rays + cameras.offsets[v] + row[l] * width + column[l];
+    const int64_t block = (row[l] >> kReachBits) * blocks + (column[l] >> kReachBits);
+    out.reach[l] = cameras.reach + 2 * (cameras.reach_offsets[v] + block);
   }
 }
 
@@ -112,6 +118,7 @@ SURFCAP_HD int find_shares(const Stand<Real>& stand, int first, int64_t width, c
                            Share<Real>* shares) {
   int found = 0;
   for (int l = 0; l < kLanes; ++l) {
+    if (stand.k[l] + 1 < stand.reach[l][0] || stand.k[l] >= stand.reach[l][1]) continue;
     for (int c = 0; c < 4; ++c) {
       const int32_t ray = stand.corner[l][(c & 1) + (c >> 1) * width];
       if (ray < 0) continue;
@@ -129,6 +136,26 @@ SURFCAP_HD int find_shares(const Stand<Real>& stand, int first, int64_t width, c
     }
   }
   return found;
+}
+
+// Fills the reach of one camera's window; `reach` is that of its first block.
+template <class Real>
+SURFCAP_HD void find_reach(const SlotCameras<Real>& cameras, const SlotRows<Real>& rows, int64_t v, int32_t* reach) {
+  const int64_t width = cameras.windows[4 * v + 2], height = cameras.windows[4 * v + 3];
+  const int64_t wide = ((width - 1) >> kReachBits) + 1, high = ((height - 1) >> kReachBits) + 1;
+  const int32_t* const rays = cameras.rays + cameras.offsets[v];
+  for (int64_t b = 0; b < wide * high; ++b, reach += 2) {
+    reach[0] = INT_MAX;
+    reach[1] = INT_MIN;
+    const int64_t left = (b % wide) << kReachBits, top = (b / wide) << kReachBits, side = (1 << kReachBits) + 1;
+    for (int64_t y = top; y < smaller(top + side, height); ++y)
+      for (int64_t x = left; x < smaller(left + side, width); ++x) {
+        const int32_t ray = rays[y * width + x];
+        if (ray < 0 || rows.starts[ray] == rows.starts[ray + 1]) continue;
+        reach[0] = smaller(reach[0], rows.first[ray]);
+        reach[1] = larger(reach[1], int32_t(rows.first[ray] + rows.starts[ray + 1] - rows.starts[ray]));
+      }
+  }
 }
 
 // The gradient of one tile's voxels, all cameras in their order. Memory rule: writes `gradient` [4, 4, 4, pitch].

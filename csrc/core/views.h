@@ -63,9 +63,15 @@ template <class Real> struct SlotCameras {
       windows;  // [V, 4] left, top, width, height: the pixels that have rays, and a border of some that have none
   const int64_t* offsets;  // [V] where each window's pixels begin
   const int32_t* rays;     // number of each pixel's ray, -1: none
+  // Per block of 2^kReachBits pixels a side, or fewer at a window's end: the least and one more than the greatest k
+  // that a row of these pixels, or of their neighbours to the right and below, has.
+  const int32_t* reach;
+  const int64_t* reach_offsets;  // [V] where each window's blocks begin
   int64_t views;
   Real step;  // distance between samples, world units
 };
+
+constexpr int kReachBits = 3;
 
 template <class Real> struct VoxelTerms {
   Real tv_opacity, tv_color, parsimony, ballooning, curvature;  // weights

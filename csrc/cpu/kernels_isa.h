@@ -254,11 +254,11 @@ void soft_hull(const Silhouettes<Real>& silhouettes, const Real* points, int64_t
 
 namespace SURFCAP_ISA {
 template <class Real> const Kernels<Real>& kernels() {
-  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,          sample_forward<Real>,  sample_backward<Real>,
-                                       march_forward<Real>,       march_backward<Real>,  photometric_step<Real>,
-                                       photometric_lattice<Real>, gather_gradient<Real>, integration_ranges<Real>,
-                                       visibility<Real>,          voxel_terms<Real>,     adam_step<Real>,
-                                       soft_hull<Real>,           upscale<Real>};
+  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,          sample_forward<Real>, sample_backward<Real>,
+                                       march_forward<Real>,       march_backward<Real>, photometric_step<Real>,
+                                       photometric_lattice<Real>, find_reach<Real>,     gather_gradient<Real>,
+                                       integration_ranges<Real>,  visibility<Real>,     voxel_terms<Real>,
+                                       adam_step<Real>,           soft_hull<Real>,      upscale<Real>};
   return table;
 }
 template const Kernels<float>& kernels<float>();

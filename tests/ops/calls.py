@@ -15,7 +15,8 @@ from torch_surfcap import reference
 from torch_surfcap.reference import TRANSPARENCY
 
 ops: Any = _ops  # untyped: the tests unpack lists of arguments into its functions
-WRITES = {"photometric_lattice": [20], "gather_gradient": [14], "voxel_terms": [7], "adam_step": [0, 2, 3]}  # arguments that an op changes in place
+# Arguments that an op changes in place.
+WRITES = {"photometric_lattice": [20], "gather_gradient": [14], "voxel_terms": [7], "adam_step": [0, 2, 3]}
 NAMES = (
     "sample_forward",
     "sample_backward",

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from tests.ops.calls import GROUPS, MODES, arguments, normal, ops
 from tests.ops.fields import Scene, assert_close, make_scene, one_tile
-from torch_surfcap import reference
+from torch_surfcap import reference as _reference
 from torch_surfcap.reference import TRANSPARENCY
 
+reference: Any = _reference  # untyped, as ops is
 LARGEST = torch.finfo(torch.float8_e5m2).max
 
 
@@ -178,7 +179,7 @@ def test_wrong_slots_are_named(device: str) -> None:
     for name in ("photometric_lattice", "gather_gradient"):
         good = arguments(name, scene)
         at = 17 if name == "photometric_lattice" else 10
-        starts, first, exponent, slots = good[at : at + 4]
+        starts, first, _, slots = good[at : at + 4]
 
         def fails(i: int, wrong: Any, match: str, name: str = name, good: list[Any] = good) -> None:
             with pytest.raises(RuntimeError, match=match):

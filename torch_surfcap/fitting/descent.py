@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,6 +28,7 @@ BEND = (
     0.4  # voxels^-1, the sum of curvatures above which bending costs linearly: edges and thin parts survive
 )
 
+RAY_ARGUMENTS = ("origins", "directions", "background", "target", "mask", "weight")
 RAY_LOSSES = ("photo", "sample", "mask")
 VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
 
@@ -100,7 +102,16 @@ def descend(
     weights = torch.tensor([*ray_weights, *voxel_weights], dtype=torch.float64)
     frame = grid.frame(*MISSING[settings.opacity])
     bundle = (rays.origins, rays.directions)
-    seen = (rays.background, rays.target, rays.mask, rays.weight)
+    arguments: dict[str, Any] = {
+        "voxels": store,
+        "table": grid.table,
+        "frame": frame,
+        **{name: getattr(rays, name) for name in RAY_ARGUMENTS},
+        **march._asdict(),
+        "huber": loss.huber,
+        "weights": ray_weights,
+        "detach_sample": loss.detach_sample,
+    }
     gathered = GatheredGradient(rays, grid, settings, march) if settings.gradient == "gather" else None
     groups = 0 if gathered else gradient_groups(store.numel())
     gradients = store.new_empty(groups, *store.shape)
@@ -117,17 +128,17 @@ def descend(
             watch.lap("ranges")
         lattices = len(rays.cameras) if gathered else len(rays)
         shift = (torch.rand(lattices, generator=generator) - 0.5) * settings.descent.jitter
-        lost = (*march, loss.huber, ray_weights, loss.detach_sample)
+        arguments["shift"] = gathered.per_ray(shift) if gathered else shift
         cosines: dict[str, float] = {}
         if gathered:
-            step = (store, grid.table, frame, *bundle, gathered.per_ray(shift), *seen, *lost)
-            ray_losses, gradient = gathered.step(step, shift, watch)
+            ray_losses, gradient = gathered.step(arguments, shift, watch)
             if rule.scale != compared:
-                cosines, compared = gathered.cosines(step), rule.scale
+                cosines, compared = gathered.cosines(arguments), rule.scale
                 watch.lap("compare")
         else:
-            step = (store, grid.table, frame, *bundle, shift, *seen, *lost)
-            ray_losses, gradient, _, _ = ops.photometric_step(*step, ranges=rays.ranges, gradients=gradients)
+            ray_losses, gradient, _, _ = ops.photometric_step(
+                **arguments, ranges=rays.ranges, gradients=gradients
+            )
             watch.lap("march")
         voxel_losses = ops.voxel_terms(
             store, grid.table, frame, grid.places, voxel_weights, PARSIMONY_HUBER, BEND, gradient

@@ -3,6 +3,7 @@ and the cameras that the voxels read them by."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -64,14 +65,22 @@ class GatheredGradient:
         """The cameras' shifts [N] for every ray [R]."""
         return shift.repeat_interleave(torch.tensor(self.rays.camera_starts).diff())
 
-    def step(self, arguments: tuple[Any, ...], shift: Tensor, watch: Stopwatch) -> tuple[Tensor, Tensor]:
-        """Losses [3] and gradient [T, 4, 4, 4, P], for the arguments of ``ops.photometric_step`` up to detach_sample and
-        the cameras' shifts [N] in them."""
-        store = arguments[0]
+    def step(self, arguments: dict[str, Any], shift: Tensor, watch: Stopwatch) -> tuple[Tensor, Tensor]:
+        """Losses [3] and gradient [T, 4, 4, 4, P].
+
+        Args:
+            arguments: of ``ops.photometric_step``, without ranges and memory. shift: [N], the cameras' in them.
+        """
+        store = arguments["voxels"]
         if self.gradient.shape != store.shape:
             self.gradient = torch.empty_like(store)
-        rows = (self.starts, self.first, self.exponent, self.slots)
-        losses, _, _ = ops.photometric_lattice(*arguments, *rows, ranges=self.rays.ranges)
+        rows: dict[str, Any] = {
+            "starts": self.starts,
+            "first": self.first,
+            "exponent": self.exponent,
+            "slots": self.slots,
+        }
+        losses, _, _ = ops.photometric_lattice(**arguments, **rows, ranges=self.rays.ranges)
         watch.lap("march")
         ops.gather_gradient(
             store,
@@ -84,15 +93,15 @@ class GatheredGradient:
             self.window_rays,
             shift,
             self.march.step,
-            *rows,
-            self.gradient,
+            **rows,
+            gradient=self.gradient,
         )
         watch.lap("gather")
         return losses, self.gradient
 
-    def cosines(self, arguments: tuple[Any, ...]) -> dict[str, float]:
+    def cosines(self, arguments: dict[str, Any]) -> dict[str, float]:
         """Of the angles between the last step's gradient and the exact one, for the opacity value and for colour."""
-        exact = ops.photometric_step(*arguments, ranges=self.rays.ranges)[1]
+        exact = ops.photometric_step(**arguments, ranges=self.rays.ranges)[1]
         parts = {"cosine_opacity": slice(0, 1), "cosine_color": slice(1, None)}
         return {
             name: float(
@@ -120,7 +129,7 @@ def slot_rows(ranges: tuple[Tensor, Tensor], step: float) -> tuple[Tensor, Tenso
 def camera_windows(pixels: Tensor, camera_starts: list[int]) -> tuple[Tensor, Tensor]:
     """``windows [N, 4]`` and ``window_rays`` of ``ops.gather_gradient`` for rays through these pixels [R, 2]."""
     windows, maps = [], []
-    for begin, end in zip(camera_starts[:-1], camera_starts[1:], strict=True):
+    for begin, end in itertools.pairwise(camera_starts):
         if begin == end:
             windows.append([0, 0, 0, 0])
             continue

@@ -94,8 +94,9 @@ def gather_rays(
         starts.append(starts[-1] + len(index))
     joined = [torch.cat(column).contiguous() for column in zip(*parts, strict=True)]
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
-    *seen, pixels = joined
-    return RayBatch(*seen, (offsets, torch.cat(ranges)), starts, pixels, cameras)
+    origins, directions, target, background, soft, weight, pixels = joined
+    found = (offsets, torch.cat(ranges))
+    return RayBatch(origins, directions, target, background, soft, weight, found, starts, pixels, cameras)
 
 
 def colorless(store: Tensor) -> Tensor:

@@ -22,7 +22,17 @@ from .rays import (
     visibility,
 )
 from .slots import coded, gather_gradient, photometric_lattice
-from .store import INSIDE, OUTSIDE, TILE, corners, dense, nonempty_cells, sample_backward, sample_forward, upscale
+from .store import (
+    INSIDE,
+    OUTSIDE,
+    TILE,
+    corners,
+    dense,
+    nonempty_cells,
+    sample_backward,
+    sample_forward,
+    upscale,
+)
 from .voxels import adam_step, huber_norm, soft_hull, voxel_terms
 
 __all__ = [

@@ -115,9 +115,7 @@ def gather_gradient(
     gradient.copy_(total.view(gradient.shape))
 
 
-def lattice_values(
-    corner: Tensor, window: Tensor, starts: Tensor, first: Tensor, values: Tensor
-) -> Tensor:
+def lattice_values(corner: Tensor, window: Tensor, starts: Tensor, first: Tensor, values: Tensor) -> Tensor:
     """[P,4]: what stands at the places [P,3] = (row, column, k) of a camera's lattice; 0 where nothing does."""
     row, column, k = corner.unbind(-1)
     height, width = window.shape
