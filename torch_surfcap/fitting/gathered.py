@@ -55,12 +55,6 @@ class GatheredGradient:
         dtype = torch.uint8 if self.narrow else self.rays.origins.dtype
         self.slots = torch.empty(int(self.starts[-1]), 4, dtype=dtype)
 
-    @property
-    def memory(self) -> int:
-        """Bytes of slots, rows, windows and gradient."""
-        tensors = (self.slots, self.starts, self.first, self.window_rays, self.gradient)
-        return sum(t.numel() * t.element_size() for t in tensors)
-
     def per_ray(self, shift: Tensor) -> Tensor:
         """The cameras' shifts [N] for every ray [R]."""
         return shift.repeat_interleave(torch.tensor(self.rays.camera_starts).diff())
