@@ -8,6 +8,7 @@
 #include <torch/headeronly/util/Exception.h>
 
 #include <algorithm>
+#include <cmath>
 #include <initializer_list>
 #include <optional>
 #include <string>
@@ -163,6 +164,68 @@ template <class Real> RaySettings<Real> ray_settings(int64_t opacity, double slo
   STD_TORCH_CHECK(step > 0, "step: expected a positive length, got ", step);
   return {Real(step), Real(stop), Real(slope), int32_t(opacity)};
 }
+
+// Everything that the photometric loss of many rays is computed from.
+template <class Real> struct PhotometricArgument {
+  FieldArgument<Real> field;
+  RaysArgument<Real> rays;
+  RangesArgument<Real> stretches;
+  RaySettings<Real> settings;
+  Input<Real> target, mask, weight;
+  Observation<Real> seen;
+  PhotometricSettings<Real> loss;
+
+  PhotometricArgument(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
+                      const Tensor& origins, const Tensor& directions, const Tensor& shift, const Tensor& background,
+                      const Tensor& photograph, const Tensor& silhouette, const Tensor& importance,
+                      const std::optional<Tensor>& range_offsets, const std::optional<Tensor>& ranges, int64_t opacity,
+                      double slope, double step, double stop, double huber, const std::vector<double>& weights,
+                      bool detach_sample, bool rendered_sample)
+      : field(voxels, table, frame),
+        rays(origins, directions, shift, background),
+        stretches(range_offsets, ranges, rays.view),
+        settings(ray_settings<Real>(opacity, slope, step, stop)),
+        target("target", photograph, {rays.view.count, 3}),
+        mask("mask", silhouette, {rays.view.count}),
+        weight("weight", importance, {rays.view.count}),
+        seen{target.data(), mask.data(), weight.data()} {
+    STD_TORCH_CHECK(weights.size() == 3, "weights: expected [photo, sample, mask], got ", weights.size(), " numbers");
+    loss = {Real(huber), Real(weights[0]), Real(weights[1]), Real(weights[2]), detach_sample, rendered_sample};
+  }
+};
+
+// The places of the field's tiles in its table.
+inline Input<int32_t> tile_places(const Tensor& coordinates, int64_t tiles, const int32_t (&n)[3]) {
+  Input<int32_t> places("coordinates", coordinates, {tiles, 3});
+  for (int64_t i = 0; i < 3 * tiles; ++i)
+    STD_TORCH_CHECK(places.data()[i] > 0 && places.data()[i] < n[i % 3] - 1,
+                    "coordinates: expected every tile inside the table's border");
+  return places;
+}
+
+// The layout of slots, for `rays` rays or, where these are told by it, kAny.
+template <class Real> struct SlotRowsArgument {
+  Input<int64_t> starts;
+  Input<int32_t> first;
+  bool narrow;
+  SlotRows<Real> view;
+
+  SlotRowsArgument(const Tensor& s, const Tensor& f, int64_t exponent, const Tensor& slots, int64_t rays)
+      : starts("starts", s, {rays == kAny ? f.size(0) + 1 : rays + 1}),
+        first("first", f, {rays}),
+        narrow(slots.scalar_type() == ScalarType::Byte),
+        view{starts.data(), first.data(), Real(std::ldexp(1.0, int(exponent)))} {
+    const int64_t* const end = starts.data() + starts.tensor().size(0);
+    check_shape("slots", slots, {kAny, 4});
+    STD_TORCH_CHECK(narrow || slots.scalar_type() == TypeOf<Real>::value, "slots: expected uint8 or ",
+                    TypeOf<Real>::name);
+    STD_TORCH_CHECK(slots.is_contiguous(), "slots: expected contiguous memory");
+    STD_TORCH_CHECK(*starts.data() == 0 && end[-1] == slots.size(0) && std::is_sorted(starts.data(), end),
+                    "starts: expected numbers that begin with 0, do not fall and end with the number of slots, ",
+                    slots.size(0));
+    STD_TORCH_CHECK(exponent >= -100 && exponent <= 100, "exponent: expected -100 to 100, got ", exponent);
+  }
+};
 
 // Runs f<float> or f<double> by the type of `t`.
 #define SURFCAP_BY_TYPE(t, f, ...) \

@@ -5,6 +5,10 @@
 #define FIELD "Tensor voxels, Tensor table, float[] frame"
 #define RAYS "Tensor origins, Tensor directions, Tensor shift, Tensor background"
 #define MARCH "int opacity, float slope, float step, float stop"
+#define PHOTOMETRIC                                                                                            \
+  FIELD ", " RAYS ", Tensor target, Tensor mask, Tensor weight, Tensor? range_offsets, Tensor? ranges, " MARCH \
+        ", float huber, float[] weights, bool detach_sample, bool rendered_sample"
+#define SLOTS "Tensor starts, Tensor first, int exponent"
 
 STABLE_TORCH_LIBRARY(torch_surfcap, m) {
   m.def("sample_forward(" FIELD ", Tensor points) -> Tensor");
@@ -12,10 +16,11 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
   m.def("march_forward(" FIELD ", " RAYS ", " MARCH ") -> (Tensor, Tensor, Tensor)");
   m.def("march_backward(Tensor grad_color, Tensor grad_transmittance, Tensor grad_depth, " FIELD ", " RAYS ", " MARCH
         ", int groups) -> Tensor");
-  m.def("photometric_step(" FIELD ", " RAYS
-        ", Tensor target, Tensor mask, Tensor weight, "
-        "Tensor? range_offsets, Tensor? ranges, " MARCH
-        ", float huber, float[] weights, bool detach_sample, bool rendered_sample, Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
+  m.def("photometric_step(" PHOTOMETRIC ", Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
+  m.def("photometric_lattice(" PHOTOMETRIC ", " SLOTS ", Tensor(a!) slots) -> (Tensor, Tensor, Tensor)");
+  m.def("gather_gradient(" FIELD
+        ", Tensor coordinates, Tensor matrices, Tensor centers, Tensor windows, Tensor window_rays, Tensor shift, "
+        "float step, " SLOTS ", Tensor slots, Tensor(a!) gradient) -> ()");
   m.def("integration_ranges(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH
         ", float quiet) -> (Tensor, Tensor)");
   m.def("visibility(" FIELD ", Tensor origins, Tensor directions, Tensor shift, " MARCH ", int groups) -> Tensor");

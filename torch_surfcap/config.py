@@ -104,6 +104,8 @@ class Config:
     gain_per: str = _one_of("channel", *CHOICES["gain_per"])  # what has a gain and bias of its own
     start: str | None = _one_of(None, *CHOICES["start"])  # the first field of a transparency
     upscale: str | None = _one_of(None, *CHOICES["upscale"])  # of a transparency to the next level
+    gradient: str = _one_of("scatter", "scatter", "gather")  # exact, or read by the voxels (paper, eq. 19)
+    lattice: int = _one_of(32, 32, 8)  # bits of a number of the samples' gradients that "gather" keeps
     losses: LossesConfig = field(default_factory=LossesConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
@@ -177,6 +179,8 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "upscale": config.upscale,
         "box": None if config.data.box is None else tuple(config.data.box),
         "seed": config.seed,
+        "gradient": config.gradient,
+        "lattice": config.lattice,
         "threshold": config.mesh.threshold,
         "smooth": config.mesh.smooth,
         "specks": config.mesh.specks,

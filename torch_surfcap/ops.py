@@ -179,6 +179,95 @@ def photometric_step(
     return losses, gradients[0], color, transmittance
 
 
+def photometric_lattice(
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    origins: Tensor,
+    directions: Tensor,
+    shift: Tensor,
+    background: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    weight: Tensor,
+    opacity: int,
+    slope: float,
+    step: float,
+    stop: float,
+    huber: float,
+    weights: list[float],
+    detach_sample: bool,
+    starts: Tensor,
+    first: Tensor,
+    exponent: int,
+    slots: Tensor,
+    ranges: tuple[Tensor, Tensor] | None = None,
+    rendered_sample: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`photometric_step` with the gradient left at the samples, for :func:`gather_gradient` to read.
+
+    Args:
+        starts: [R + 1] int64. first: [R] int32. Slot i of ray r, ``slots[starts[r] + i]``, belongs to its sample with the
+            index k = first[r] + i. Samples beyond their ray's slots are left out, slots without a sample become 0.
+        exponent: a slot holds 2^exponent times the gradient.
+        slots: [S, 4], written in place: the gradient of ``weights . losses`` by the opacity value, r, g, b that the sample
+            read from the voxels. The field's dtype, or uint8 for the 8-bit float 1-5-2 (``torch.float8_e5m2``; nearest,
+            too large becomes the largest).
+
+    Returns:
+        losses [3] float64, not yet times ``weights``; the colours [R, 3] and transmittances [R] of the rays.
+    """
+    field, rays, seen = (
+        (voxels, table, frame),
+        (origins, directions, shift, background),
+        (target, mask, weight),
+    )
+    march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample, rendered_sample)
+    rows, stretches = (starts, first, exponent, slots), ranges or (None, None)
+    return cast(
+        "tuple[Tensor, Tensor, Tensor]",
+        _ops.photometric_lattice(*field, *rays, *seen, *stretches, *march, *loss, *rows),
+    )
+
+
+def gather_gradient(
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    coordinates: Tensor,
+    matrices: Tensor,
+    centers: Tensor,
+    windows: Tensor,
+    window_rays: Tensor,
+    shift: Tensor,
+    step: float,
+    starts: Tensor,
+    first: Tensor,
+    exponent: int,
+    slots: Tensor,
+    gradient: Tensor,
+) -> None:
+    """The gradient by the voxels as every voxel reads it from the slots of all cameras (paper, eq. 19).
+
+    dL/db_lm = sum over cameras of Y_lm(camera -> voxel) (det(K) voxel^3 d / (z^3 step)) lerp(dL/dc), d the voxel's distance
+    and z its depth; the factor is the number of samples per voxel, the lerp goes over 4 pixels x 2 samples. The same
+    without Y for the opacity value. An approximation of :func:`photometric_step`'s gradient, without sums in memory that
+    threads share: it never depends on their number.
+
+    Args:
+        voxels: only their shape and type count. coordinates: [T, 3] int32, where each tile stands in the table.
+        matrices: [V, 3, 3] K R of each camera. centers: [V, 3] world.
+        windows: [V, 4] int64 left, top, width, height of the pixels that have rays, and a border of pixels that have none;
+            width = height = 0 for a camera without rays. window_rays: int32, the windows end to end in row-major order: the
+            number of each pixel's ray, -1 where there is none.
+        shift: [V], of each camera's lattice in steps, as its rays had it. step: between samples, world units.
+        starts, first, exponent, slots: as in :func:`photometric_lattice`.
+        gradient: [T, 4, 4, 4, P], overwritten.
+    """
+    cameras, rows = (matrices, centers, windows, window_rays), (starts, first, exponent, slots)
+    _ops.gather_gradient(voxels, table, frame, coordinates, *cameras, shift, step, *rows, gradient)
+
+
 def integration_ranges(
     voxels: Tensor,
     table: Tensor,
@@ -312,6 +401,16 @@ def _register_shapes() -> None:
         rays = origins.shape[0]
         losses = voxels.new_empty(3, dtype=torch.float64)
         return losses, voxels.new_empty(rays, 3), voxels.new_empty(rays)
+
+    @fake("torch_surfcap::photometric_lattice")
+    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
+        rays = origins.shape[0]
+        losses = voxels.new_empty(3, dtype=torch.float64)
+        return losses, voxels.new_empty(rays, 3), voxels.new_empty(rays)
+
+    @fake("torch_surfcap::gather_gradient")
+    def _(*arguments):  # type: ignore[no-untyped-def]
+        return None
 
     @fake("torch_surfcap::integration_ranges")
     def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]

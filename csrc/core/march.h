@@ -18,6 +18,7 @@ template <class Real, class Opacity> struct Sample {
   Pack<Real, 4> color;  // the field's opacity value here, then r, g, b as composited
   Real t, a, transmittance;
   typename Opacity::State before, now;
+  int32_t k;  // its index on the lattice
   bool starts_run;
 };
 
@@ -81,6 +82,7 @@ template <class Real, int Degree, class Opacity> struct Walk {
         sample.now = before = opacity.prepare(color[0]);
         sample.a = opacity.transparency(sample.before, sample.now);
         sample.t = t[l];
+        sample.k = k[l];
         sample.transmittance = ray.transmittance;
         if constexpr (Opacity::kMidpointColor) {
           const Pack<Real, 4> here = color;
@@ -116,12 +118,28 @@ template <class Real, int Degree, class Opacity> struct Walk {
   }
 };
 
+// Adds the samples' gradients to the voxels that they read. Memory rule: adds.
+template <class Real, int Degree> struct ToVoxels {
+  Real* gradient;  // [tiles, 4, 4, 4, pitch]
+  Real* spare;
+
+  // What the walk back will add to: it is fetched meanwhile.
+  const Real* prefetched() const { return gradient; }
+
+  template <class Walk> SURFCAP_HD auto sink(const Walk& walk, int64_t) const {
+    return [this, &walk](int i, const auto&, const Pack<Real, 4>& g) {
+      scatter<Real, Degree>(gradient, spare, walk.trace.footprints[i / kLanes], i % kLanes,
+                            unfold<Real, Degree>(g, walk.weights));
+    };
+  }
+};
+
 // `term(sample, dc)` returns a sample's r_k and sets lanes 1..3 of dc to the loss's derivative by its colour per unit
-// of weight w_k (what is left out of r_k does not move the weights). Gradients are scattered into `gradient`.
-template <class Real, int Degree, class Opacity, class Term>
-SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const Opacity& opacity,
-                          const Coefficients<Real, Degree>& weights, Real r_inf, const Term& term, Real* gradient,
-                          Real* spare) {
+// of weight w_k (what is left out of r_k does not move the weights). `sink(i, sample, g)` takes the derivative g by
+// what sample i read, (opacity, r, g, b), from the last sample to the first.
+template <class Real, class Opacity, class Term, class Sink>
+SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const Opacity& opacity, Real r_inf,
+                          const Term& term, const Sink& sink) {
   Real behind = r_inf;
   Pack<Real, 4> carried = zero_pack<Real, 4>();  // what the sample behind says about this sample's value and colour
   for (int i = samples - 1; i >= 0; --i) {
@@ -142,7 +160,7 @@ SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const 
     g[0] = by_a * by_current;
     g += carried;
     carried = to_previous;
-    scatter<Real, Degree>(gradient, spare, trace.footprints[i / kLanes], i % kLanes, unfold<Real, Degree>(g, weights));
+    sink(i, sample, g);
   }
 }
 

@@ -1,7 +1,7 @@
 // What is done with one ray: rendering, its adjoint, the fused photometric step, and the visibility of voxels.
 #pragma once
 
-#include "march.h"
+#include "slots.h"
 
 namespace surfcap {
 inline namespace SURFCAP_ISA {
@@ -57,9 +57,10 @@ template <class Real, int Degree, class Opacity> struct Marcher {
     finish(walk, gradient);
   }
 
-  template <class Term>
-  SURFCAP_HD void back(const Walk& walk, Real r_inf, const Term& term, Real* gradient, Real* spare) const {
-    walk_back<Real, Degree, Opacity>(walk.trace, walk.ray.samples, opacity, walk.weights, r_inf, term, gradient, spare);
+  // The walk back of ray i, whose gradient goes `to` the voxels or to slots.
+  template <class Term, class To>
+  SURFCAP_HD void back(const Walk& walk, int64_t i, Real r_inf, const Term& term, const To& to) const {
+    walk_back<Real, Opacity>(walk.trace, walk.ray.samples, opacity, r_inf, term, to.sink(walk, i));
   }
 };
 
@@ -75,13 +76,13 @@ SURFCAP_HD void render_ray(const Marcher<Real, Degree, Opacity>& march, const Ra
   depth[i] = ray.opacity > kNothing<Real> ? ray.sum[0] / ray.opacity : Real(__builtin_nan(""));
 }
 
-// The adjoint of render_ray by the voxels: adds to `gradient`.
+// The adjoint of render_ray by the voxels.
 template <class Real, int Degree, class Opacity>
 SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
                                     const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth,
-                                    Real* gradient, Real* spare) {
+                                    const ToVoxels<Real, Degree>& to) {
   typename Marcher<Real, Degree, Opacity>::Walk walk;
-  march.walk(walk, rays, i, gradient);
+  march.walk(walk, rays, i, to.prefetched());
   const RayResult<Real>& ray = walk.ray;
   // depth D = S/O with S = sum w t and O = sum w: dD = (t - D)/O per unit of w. Empty rays have no depth to pull on.
   const bool solid = ray.opacity > kNothing<Real>;
@@ -93,16 +94,16 @@ SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march,
     dc = by_color;
     return dot_color<Real>(by_color, sample.color) + by_depth * (sample.t - depth);
   };
-  march.back(walk, r_inf, term, gradient, spare);
+  march.back(walk, i, r_inf, term, to);
 }
 
 // One ray of the fused step, its walk forward done: adds (photo, sample, mask), each times the ray's weight, to
-// `losses`, the gradient of their weighted sum to `gradient`, and writes colour and transmittance.
-template <class Real, int Degree, class Opacity>
+// `losses`, sends the gradient of their weighted sum `to` the voxels or to slots, and writes colour and transmittance.
+template <class Real, int Degree, class Opacity, class To>
 SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, const Walk<Real, Degree, Opacity>& walk,
                                 const Rays<Real>& rays, const Observation<Real>& seen,
                                 const PhotometricSettings<Real>& loss, int64_t i, double* losses, Real* color,
-                                Real* transmittance, Real* gradient, Real* spare) {
+                                Real* transmittance, const To& to) {
   const RayResult<Real>& ray = walk.ray;
   const Pack<Real, 4> target = color_of(seen.target + 3 * i), background = color_of(rays.background + 3 * i);
   const Pack<Real, 4> rendered = ray.sum + ray.transmittance * background;
@@ -131,7 +132,7 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
     sample_loss += (Real(1) - sample.a) * sample.transmittance * distance;
     return dot_color<Real>(by_color, sample.color) + (loss.detach_sample ? Real(0) : sample_weight * distance);
   };
-  march.back(walk, r_inf, term, gradient, spare);
+  march.back(walk, i, r_inf, term, to);
   losses[0] += double(weight * photo);
   losses[1] += double(weight * sample_loss);
   losses[2] += double(weight * excess * excess);
@@ -139,18 +140,17 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
 
 // The rays begin..end of the fused step, a bundle at a time: all its rays are started before the first is gone through,
 // and all are gone through before the first walk back, so that the waits for memory overlap.
-template <class Real, int Degree, class Opacity>
+template <class Real, int Degree, class Opacity, class To>
 SURFCAP_HD void photometric_rays(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays,
                                  const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin,
-                                 int64_t end, double* losses, Real* color, Real* transmittance, Real* gradient,
-                                 Real* spare) {
+                                 int64_t end, double* losses, Real* color, Real* transmittance, const To& to) {
   typename Marcher<Real, Degree, Opacity>::Walk walks[kBundle];
   for (int64_t first = begin; first < end; first += kBundle) {
     const int count = int(smaller<int64_t>(kBundle, end - first));
     for (int r = 0; r < count; ++r) march.start(walks[r], rays, first + r, r);
-    for (int r = 0; r < count; ++r) march.finish(walks[r], gradient);
+    for (int r = 0; r < count; ++r) march.finish(walks[r], to.prefetched());
     for (int r = 0; r < count; ++r)
-      photometric_ray(march, walks[r], rays, seen, loss, first + r, losses, color, transmittance, gradient, spare);
+      photometric_ray(march, walks[r], rays, seen, loss, first + r, losses, color, transmittance, to);
   }
 }
 

@@ -48,6 +48,32 @@ template <class Real> struct PhotometricSettings {
   bool rendered_sample;      // the sample loss compares with the rendered colour instead of the photograph's
 };
 
+// Where the samples' gradients are kept: a row of slots per ray, each of four numbers (opacity, r, g, b).
+template <class Real> struct SlotRows {
+  const int64_t* starts;  // [R + 1] where each ray's row begins
+  const int32_t* first;   // [R] the sample index k of its first slot
+  Real scale;             // a slot holds this many times the gradient: a power of two
+};
+
+// The cameras whose rays the rows belong to.
+template <class Real> struct SlotCameras {
+  const Real* matrices;  // [V, 3, 3] K R: from the way to a point to its homogeneous pixel
+  const Real* centers;   // [V, 3] world
+  const Real* shift;     // [V] displacement of the lattice in steps
+  const int64_t*
+      windows;  // [V, 4] left, top, width, height: the pixels that have rays, and a border of some that have none
+  const int64_t* offsets;  // [V] where each window's pixels begin
+  const int32_t* rays;     // number of each pixel's ray, -1: none
+  // Per block of 2^kReachBits pixels a side, or fewer at a window's end: the least and one more than the greatest k
+  // that a row of these pixels, or of their neighbours to the right and below, has.
+  const int32_t* reach;
+  const int64_t* reach_offsets;  // [V] where each window's blocks begin
+  int64_t views;
+  Real step;  // distance between samples, world units
+};
+
+constexpr int kReachBits = 3;
+
 template <class Real> struct VoxelTerms {
   Real tv_opacity, tv_color, parsimony, ballooning, curvature;  // weights
   Real huber, bend;  // where the parsimony's and the curvature's norm turn linear

@@ -21,6 +21,14 @@ template <class Real> struct Kernels {
   void (*photometric_step)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, const Observation<Real>&,
                            const PhotometricSettings<Real>&, int64_t begin, int64_t end, double* losses, Real* color,
                            Real* transmittance, Real* gradient);
+  // The slots are Real or, where `narrow`, 8-bit floats.
+  void (*photometric_lattice)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, const Observation<Real>&,
+                              const PhotometricSettings<Real>&, const SlotRows<Real>&, bool narrow, int64_t begin,
+                              int64_t end, double* losses, Real* color, Real* transmittance, void* slots);
+  void (*find_reach)(const SlotCameras<Real>&, const SlotRows<Real>&, int64_t view, int32_t* reach);
+  void (*gather_gradient)(const Field<Real>&, const int32_t* coordinates, const SlotCameras<Real>&,
+                          const SlotRows<Real>&, bool narrow, const void* slots, int64_t begin, int64_t end,
+                          Real* gradient);
   // Appends the ranges of each ray to `ranges` and writes their number to counts[ray].
   void (*integration_ranges)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, Real quiet, int64_t begin,
                              int64_t end, int64_t* counts, std::vector<Real>& ranges);

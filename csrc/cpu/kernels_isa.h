@@ -73,9 +73,10 @@ void march_backward(const Field<Real>& field, const Rays<Real>& rays, const RayS
                     const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth, int64_t begin,
                     int64_t end, Real* gradient) {
   Real spare[32] = {};
-  with_marcher(field, settings, [&](const auto& march) {
+  with_marcher(field, settings, [&]<int Degree, class Opacity>(const Marcher<Real, Degree, Opacity>& march) {
+    const ToVoxels<Real, Degree> to{gradient, spare};
     for (int64_t i = begin; i < end; ++i)
-      render_ray_backward(march, rays, i, grad_color, grad_transmittance, grad_depth, gradient, spare);
+      render_ray_backward(march, rays, i, grad_color, grad_transmittance, grad_depth, to);
   });
 }
 
@@ -84,8 +85,43 @@ void photometric_step(const Field<Real>& field, const Rays<Real>& rays, const Ra
                       const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin, int64_t end,
                       double* losses, Real* color, Real* transmittance, Real* gradient) {
   Real spare[32] = {};
-  with_marcher(field, settings, [&](const auto& march) {
-    photometric_rays(march, rays, seen, loss, begin, end, losses, color, transmittance, gradient, spare);
+  with_marcher(field, settings, [&]<int Degree, class Opacity>(const Marcher<Real, Degree, Opacity>& march) {
+    const ToVoxels<Real, Degree> to{gradient, spare};
+    photometric_rays(march, rays, seen, loss, begin, end, losses, color, transmittance, to);
+  });
+}
+
+// Calls f with the slots as what they are.
+template <class Real, class F> void with_slots(bool narrow, const void* slots, const F& f) {
+  if (narrow)
+    f(static_cast<const uint8_t*>(slots));
+  else
+    f(static_cast<const Real*>(slots));
+}
+
+template <class Real>
+void photometric_lattice(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                         const Observation<Real>& seen, const PhotometricSettings<Real>& loss,
+                         const SlotRows<Real>& rows, bool narrow, int64_t begin, int64_t end, double* losses,
+                         Real* color, Real* transmittance, void* slots) {
+  with_slots<Real>(narrow, slots, [&]<class Slot>(const Slot*) {
+    const ToSlots<Real, Slot> to{rows, static_cast<Slot*>(slots)};
+    with_marcher(field, settings, [&](const auto& march) {
+      photometric_rays(march, rays, seen, loss, begin, end, losses, color, transmittance, to);
+    });
+  });
+}
+
+template <class Real>
+void gather_gradient(const Field<Real>& field, const int32_t* coordinates, const SlotCameras<Real>& cameras,
+                     const SlotRows<Real>& rows, bool narrow, const void* slots, int64_t begin, int64_t end,
+                     Real* gradient) {
+  with_slots<Real>(narrow, slots, [&]<class Slot>(const Slot* typed) {
+    with_degree(field.pitch, [&](auto degree) {
+      for (int64_t t = begin; t < end; ++t)
+        gather_tile<Real, decltype(degree)::value>(field, coordinates + 3 * t, cameras, rows, typed,
+                                                   gradient + t * kTileVoxels * field.pitch);
+    });
   });
 }
 
@@ -218,10 +254,11 @@ void soft_hull(const Silhouettes<Real>& silhouettes, const Real* points, int64_t
 
 namespace SURFCAP_ISA {
 template <class Real> const Kernels<Real>& kernels() {
-  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,         sample_forward<Real>, sample_backward<Real>,
-                                       march_forward<Real>,      march_backward<Real>, photometric_step<Real>,
-                                       integration_ranges<Real>, visibility<Real>,     voxel_terms<Real>,
-                                       adam_step<Real>,          soft_hull<Real>,      upscale<Real>};
+  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,          sample_forward<Real>, sample_backward<Real>,
+                                       march_forward<Real>,       march_backward<Real>, photometric_step<Real>,
+                                       photometric_lattice<Real>, find_reach<Real>,     gather_gradient<Real>,
+                                       integration_ranges<Real>,  visibility<Real>,     voxel_terms<Real>,
+                                       adam_step<Real>,           soft_hull<Real>,      upscale<Real>};
   return table;
 }
 template const Kernels<float>& kernels<float>();

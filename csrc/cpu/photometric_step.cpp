@@ -1,55 +1,25 @@
 // photometric_step: photometric, sample and mask loss of many rays, and the gradient of their weighted sum, in one
 // call. The caller gives the memory for the partial gradients, because a fit uses the same in every iteration; fresh
 // pages would cost a third of the step.
-#include <tuple>
-
-#include "parallel.h"
+#include "photometric.h"
 
 namespace surfcap {
 
-using StepResult = std::tuple<Tensor, Tensor, Tensor>;  // losses, colour, transmittance
-
-template <class Real>
-StepResult photometric_step_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
-                                  const Tensor& origins, const Tensor& directions, const Tensor& shift,
-                                  const Tensor& background, const Tensor& target, const Tensor& mask,
-                                  const Tensor& weight, const std::optional<Tensor>& range_offsets,
-                                  const std::optional<Tensor>& ranges, int64_t opacity, double slope, double step,
-                                  double stop, double huber, const std::vector<double>& weights, bool detach_sample,
-                                  bool rendered_sample, const Tensor& gradients) {
-  const FieldArgument<Real> field(voxels, table, frame);
-  RaysArgument<Real> rays(origins, directions, shift, background);
-  const RangesArgument<Real> stretches(range_offsets, ranges, rays.view);
-  const RaySettings<Real> settings = ray_settings<Real>(opacity, slope, step, stop);
-  const int64_t count = rays.view.count;
-  const Input<Real> photograph("target", target, {count, 3});
-  const Input<Real> silhouette("mask", mask, {count});
-  const Input<Real> importance("weight", weight, {count});
-  STD_TORCH_CHECK(weights.size() == 3, "weights: expected [photo, sample, mask], got ", weights.size(), " numbers");
-  const Observation<Real> seen{photograph.data(), silhouette.data(), importance.data()};
-  const PhotometricSettings<Real> loss{Real(huber), Real(weights[0]), Real(weights[1]), Real(weights[2]),
-                                       detach_sample,
- rendered_sample};
-
-  const int64_t groups = gradients.dim() > 0 ? gradients.size(0) : 0, size = field.voxels.tensor().numel();
+template <class Real, class... Common>
+StepResult photometric_step_typed(const Tensor& gradients, const Common&... common) {
+  const PhotometricArgument<Real> step(common...);
+  const Field<Real>& field = step.field.view;
+  const int64_t groups = gradients.dim() > 0 ? gradients.size(0) : 0, size = step.field.voxels.tensor().numel();
   STD_TORCH_CHECK(groups >= 1, "gradients: expected [groups, *voxels.shape] with at least one group, got ",
                   shape_of(gradients));
-  Real* const total = output<Real>("gradients", gradients,
-                                   {groups, field.view.tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
-  const Tensor color = torch::stable::new_empty(voxels, {count, 3});
-  const Tensor transmittance = torch::stable::new_empty(voxels, {count});
-  const Tensor losses = torch::stable::new_zeros(voxels, {3}, ScalarType::Double);
+  Real* const total =
+      output<Real>("gradients", gradients, {groups, field.tiles, kTileSide, kTileSide, kTileSide, field.pitch});
   advise_large_pages(total, groups * size * int64_t(sizeof(Real)));
-  Real *const c = color.template mutable_data_ptr<Real>(), *const t = transmittance.template mutable_data_ptr<Real>();
-  std::vector<double> by_group(size_t(groups) * 3, 0.0);
-  const auto work = [&](int64_t begin, int64_t end, Real* buffer, int64_t group) {
-    best_kernels<Real>().photometric_step(field.view, rays.view, settings, seen, loss, begin, end,
-                                          by_group.data() + 3 * group, c, t, buffer);
-  };
-  grouped(count, groups, size, total, total + size, work, [](Real a, Real b) { return a + b; });
-  double* const sum = losses.template mutable_data_ptr<double>();
-  for (size_t i = 0; i < by_group.size(); ++i) sum[i % 3] += by_group[i];
-  return {losses, color, transmittance};
+  return photometric<Real>(step, groups, size, total,
+                           [&](int64_t begin, int64_t end, double* losses, Real* color, Real* left, Real* buffer) {
+                             best_kernels<Real>().photometric_step(field, step.rays.view, step.settings, step.seen,
+                                                                   step.loss, begin, end, losses, color, left, buffer);
+                           });
 }
 
 StepResult photometric_step(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins, Tensor directions,
@@ -57,9 +27,9 @@ StepResult photometric_step(Tensor voxels, Tensor table, std::vector<double> fra
                             std::optional<Tensor> range_offsets, std::optional<Tensor> ranges, int64_t opacity,
                             double slope, double step, double stop, double huber, std::vector<double> weights,
                             bool detach_sample, bool rendered_sample, Tensor gradients) {
-  return SURFCAP_BY_TYPE(voxels, photometric_step_typed, voxels, table, frame, origins, directions, shift, background,
-                         target, mask, weight, range_offsets, ranges, opacity, slope, step, stop, huber, weights,
-                         detach_sample, rendered_sample, gradients);
+  return SURFCAP_BY_TYPE(voxels, photometric_step_typed, gradients, voxels, table, frame, origins, directions, shift,
+                         background, target, mask, weight, range_offsets, ranges, opacity, slope, step, stop, huber,
+                         weights, detach_sample, rendered_sample);
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("photometric_step", TORCH_BOX(&photometric_step)); }

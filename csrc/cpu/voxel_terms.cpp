@@ -12,16 +12,13 @@ Tensor voxel_terms_typed(const Tensor& voxels, const Tensor& table, const std::v
                          const Tensor& gradient) {
   const FieldArgument<Real> field(voxels, table, frame);
   const int64_t tiles = field.view.tiles;
-  const Input<int32_t> places("coordinates", coordinates, {tiles, 3});
+  const Input<int32_t> places = tile_places(coordinates, tiles, field.view.n);
   STD_TORCH_CHECK(weights.size() == kVoxelTerms,
                   "weights: expected [tv_opacity, tv_color, parsimony, ballooning, curvature], got ", weights.size(),
                   " numbers");
   const VoxelTerms<Real> terms{Real(weights[0]), Real(weights[1]), Real(weights[2]), Real(weights[3]),
                                Real(weights[4]), Real(huber),      Real(bend)};
   Real* const to = output<Real>("gradient", gradient, {tiles, kTileSide, kTileSide, kTileSide, field.view.pitch});
-  for (int64_t i = 0; i < 3 * tiles; ++i)
-    STD_TORCH_CHECK(places.data()[i] > 0 && places.data()[i] < field.view.n[i % 3] - 1,
-                    "coordinates: expected every tile inside the table's border");
 
   // A fixed number of blocks, each with its own sums, so that the values do not depend on the threads.
   constexpr int64_t kBlocks = 64;

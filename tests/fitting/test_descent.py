@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,14 +10,13 @@ import torch
 from torch import Tensor
 
 from tests.fitting.sphere import ball
+from tests.fitting.stages import begun
 from torch_surfcap import ops
 from torch_surfcap.fitting.adam import BOUNDS, TileAdam
 from torch_surfcap.fitting.budget import GROUP_BYTES, GROUPS, gradient_groups
 from torch_surfcap.fitting.descent import descend
-from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.settings import Descent, FitSettings
-from torch_surfcap.fitting.stage import begin_stage, open_studio
 
 
 @pytest.fixture
@@ -109,14 +107,7 @@ def test_rates_and_bounds(degree: int, opacity: str) -> None:
 
 def run(opacity: str, iterations: int, **more: Any) -> tuple[Tensor, list[dict[str, float]]]:
     """A level of a small ball from its hull on."""
-    capture = ball(6, 32)
-    box = subject_box(capture, None)
-    plan = [replace(plan_levels(capture, box, 0.06, 1)[0], iterations=iterations)]
-    settings = FitSettings.of(opacity=opacity, **more).suited(capture.mask_source)
-    studio = open_studio(capture, settings, 0)
-    stage = begin_stage(
-        settings, plan, 0, *first_field(capture, box, plan[0].voxel_size, settings, 1), studio
-    )
+    stage, studio, settings = begun(ball(6, 32), 0.06, iterations, opacity=opacity, **more)
     rows = list(descend(stage, studio, settings))
     assert set(stage.seconds) >= {"march", "voxels", "adam"}
     return stage.store, rows

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.fitting.sphere import CENTER, RADIUS, ball, photographed, ring
-from torch_surfcap import InputError, SurfaceField, ops
+from torch_surfcap import Cameras, InputError, SurfaceField, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.field.field import CLAMP, ETA, SLOPE
 from torch_surfcap.field.tiles import TileGrid, voxel_centers
@@ -134,7 +134,8 @@ def plane() -> tuple[TileGrid, Tensor, Tensor, float]:
 def no_rays() -> RayBatch:
     empty, three = torch.zeros(0, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     ranges = (torch.zeros(1, dtype=torch.int64), torch.zeros(0, 2, dtype=torch.float64))
-    return RayBatch(three, three, three, three, empty, empty, ranges, [0], empty.int())
+    cameras = Cameras(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4), torch.zeros(0, 2))
+    return RayBatch(three, three, three, three, empty, empty, ranges, [0], empty.int(), cameras)
 
 
 def test_next_level_of_a_distance() -> None:

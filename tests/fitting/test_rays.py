@@ -77,7 +77,7 @@ def test_samples_are_counted_over_the_ranges() -> None:
     """Ranges of 1 and 0.5, with samples 0.25 apart: 4 and 2."""
     one = torch.zeros(2, 3)
     ranges = (torch.tensor([0, 1, 2]), torch.tensor([[1.0, 2.0], [3.0, 3.5]]))
-    rays = RayBatch(one, one, one, one, one[:, 0], one[:, 0], ranges, [0, 2], one[:, 0].int())
+    rays = RayBatch(one, one, one, one, one[:, 0], one[:, 0], ranges, [0, 2], one[:, 0].int(), ring(1))
     assert rays.samples(0.25) == 6
 
 

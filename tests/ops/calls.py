@@ -15,13 +15,16 @@ from torch_surfcap import reference
 from torch_surfcap.reference import TRANSPARENCY
 
 ops: Any = _ops  # untyped: the tests unpack lists of arguments into its functions
-WRITES = {"voxel_terms": [7], "adam_step": [0, 2, 3]}  # arguments that an op changes in place
+# Arguments that an op changes in place.
+WRITES = {"photometric_lattice": [20], "gather_gradient": [14], "voxel_terms": [7], "adam_step": [0, 2, 3]}
 NAMES = (
     "sample_forward",
     "sample_backward",
     "march_forward",
     "march_backward",
     "photometric_step",
+    "photometric_lattice",
+    "gather_gradient",
     "visibility",
     "voxel_terms",
     "adam_step",
@@ -64,6 +67,11 @@ def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
     if name == "photometric_step":
         seen = (scene.target, scene.mask, scene.weight)
         return [*scene.field, *scene.rays, *seen, *march, 0.1, [1.0, 0.7, 0.3], False, GROUPS]
+    if name == "photometric_lattice":
+        step = arguments("photometric_step", scene, stop)[:-1]
+        return [*step, *slot_rows(scene), 3, normal(v, int(slot_rows(scene)[0][-1]), 4)]
+    if name == "gather_gradient":
+        return gather_arguments(scene)
     if name == "visibility":
         return [*scene.field, *scene.rays[:3], *march, GROUPS]
     if name == "voxel_terms":
@@ -89,26 +97,74 @@ def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
     raise KeyError(name)
 
 
-def hull_arguments(scene: Scene) -> list[Any]:
-    """Points, three cameras at different sides with pictures of different sizes, and random masks."""
-    v = scene.voxels
+SIZES = ((9, 6), (5, 8), (1, 3))  # width, height of three cameras' pictures
+
+
+def cameras(scene: Scene) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """K, R and centre of three cameras at different sides, in double; the field fills their pictures."""
     low = torch.tensor(scene.frame[:3], dtype=torch.float64)
     middle = low + 2 * len(scene.table) * scene.frame[3]
-    sizes, projections = [(9, 6), (5, 8), (1, 3)], []
-    for (width, height), eye in zip(
-        sizes, torch.tensor([[0, 0, -2.0], [0.5, 0, 2.2], [1.8, 0.3, 0]]), strict=True
-    ):
-        forward = torch.nn.functional.normalize(-eye.double(), dim=0)
+    found = []
+    eyes = torch.tensor([[0, 0, -2.0], [0.5, 0, 2.2], [1.8, 0.3, 0]], dtype=torch.float64)
+    for (width, height), eye in zip(SIZES, eyes, strict=True):
+        forward = torch.nn.functional.normalize(-eye, dim=0)
         right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.1], dtype=torch.float64), forward)
         right = right / right.norm()
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        camera = torch.cat([rotation, -(rotation @ (middle + eye))[:, None]], 1)
         k = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=torch.float64)
-        projections.append(k @ camera)
-    pixels = sum(width * height for width, height in sizes)
-    masks = normal(v, pixels).abs().clamp(max=1)
+        found.append((k, rotation, middle + eye))
+    return found
+
+
+def hull_arguments(scene: Scene) -> list[Any]:
+    """Points, three cameras with pictures of different sizes, and random masks."""
+    v = scene.voxels
+    middle = torch.tensor(scene.frame[:3], dtype=torch.float64) + 2 * len(scene.table) * scene.frame[3]
+    projections = [k @ torch.cat([r, -(r @ center)[:, None]], 1) for k, r, center in cameras(scene)]
+    masks = normal(v, sum(width * height for width, height in SIZES)).abs().clamp(max=1)
     points = scene.origins * 0.6 + 0.4 * middle.to(v)
-    return [points, torch.stack(projections).to(v), masks, torch.tensor(sizes, device=v.device)]
+    return [points, torch.stack(projections).to(v), masks, torch.tensor(SIZES, device=v.device)]
+
+
+def slot_rows(scene: Scene) -> tuple[Tensor, Tensor]:
+    """Rows of 0 to 24 slots, 12 in the mean, that begin before or after their rays' first samples."""
+    rays, device = len(scene.origins), scene.voxels.device
+    counts = torch.tensor([24 * (i % 2) for i in range(rays)], dtype=torch.int64, device=device)
+    if rays % 2:
+        counts[-1] = 12
+    starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    return starts, (torch.arange(rays, device=device) % 7 - 3).int()
+
+
+def gather_arguments(scene: Scene) -> list[Any]:
+    """Three cameras, a third of whose pixels have no ray, and rows of random slots around the field's distance."""
+    v = scene.voxels
+    found, windows, pixels, rays = cameras(scene), [], [], 0
+    for width, height in SIZES:
+        window = torch.full((height + 2, width + 2), -1, dtype=torch.int32)
+        kept = normal(v, height, width, seed=rays + 1).cpu() > -0.4
+        window[1:-1, 1:-1][kept] = torch.arange(rays, rays + int(kept.sum()), dtype=torch.int32)
+        windows.append([-1, -1, width + 2, height + 2])
+        pixels.append(window.flatten())
+        rays += int(kept.sum())
+    counts = (8 + 4 * normal(v, rays)).long().clamp(min=0)
+    starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    first = (10 + 3 * normal(v, rays, seed=2)).int()
+    return [
+        *scene.field,
+        scene.coordinates,
+        torch.stack([k @ r for k, r, _ in found]).to(v),
+        torch.stack([center for *_, center in found]).to(v),
+        torch.tensor(windows, device=v.device),
+        torch.cat(pixels).to(v.device),
+        0.4 * normal(v, len(found)).clamp(-1, 1),
+        scene.step,
+        starts,
+        first,
+        5,
+        normal(v, int(starts[-1]), 4),
+        normal(v, *v.shape),
+    ]
 
 
 def cloned(arguments: Sequence[Any]) -> list[Any]:
@@ -124,7 +180,22 @@ def run(module: ModuleType, name: str, arguments: Sequence[Any]) -> list[Tensor]
     outputs = [] if returned is None else [returned] if isinstance(returned, Tensor) else list(returned)
     if name == "march_forward":
         outputs[2] = outputs[2].where(has_depth(outputs[1]), 0)
-    return outputs + [given[i] for i in WRITES.get(name, [])]
+    outputs += [given[i] for i in WRITES.get(name, [])]
+    if name == "photometric_lattice":
+        outputs[-1] = outputs[-1] * reads_voxels(given)[:, None]
+    return outputs
+
+
+def reads_voxels(lattice_arguments: Sequence[Any]) -> Tensor:
+    """[S] bool: slots whose samples read a stored voxel. Elsewhere distances do not change along a ray, so that rounding
+    decides whether a_k = min(1, ...) has a derivative."""
+    _, table, frame, origins, directions, shift, *_ = lattice_arguments
+    step, (starts, first) = lattice_arguments[12], lattice_arguments[17:19]
+    ray = torch.arange(len(first), device=first.device).repeat_interleave(starts.diff())
+    k = torch.arange(len(ray), device=first.device) - starts[ray] + first[ray]
+    points = origins[ray] + ((k + 0.5 + shift[ray]) * step)[:, None] * directions[ray]
+    index, weight, _ = reference.corners(points, table, frame)
+    return ((table[(index // reference.TILE).unbind(-1)] >= 0) & (weight > 1e-6)).any(-1)
 
 
 def raw(name: str, arguments: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
@@ -132,6 +203,8 @@ def raw(name: str, arguments: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
     given = tuple(cloned(arguments))
     if name == "adam_step":
         given = (*given[:7], 0.9, 0.99, 1e-8, given[7])
+    if name == "photometric_lattice":
+        given = (*given[:10], None, None, *given[10:17], False, *given[17:])
     if name == "photometric_step":
         voxels, groups = given[0], given[-1]
         given = (*given[:10], None, None, *given[10:-1], False, voxels.new_empty(groups, *voxels.shape))

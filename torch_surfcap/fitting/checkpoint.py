@@ -84,7 +84,19 @@ class Saved:
         adam.first, adam.second, adam.t = arrays["first"], arrays["second"], plain["t"]
         march = march_of(settings, level, number == len(plan) - 1)
         rule = Plateau(**plain["rule"])
-        return Stage(number, level, grid, store, march, rays, adam, rule, plain["moved"], plain["seconds"])
+        return Stage(
+            number,
+            level,
+            grid,
+            store,
+            march,
+            rays,
+            adam,
+            rule,
+            plain["moved"],
+            plain["compared"],
+            plain["seconds"],
+        )
 
 
 @dataclass
@@ -124,6 +136,7 @@ class Checkpoints:
             "number": stage.number,
             "rule": asdict(stage.rule),
             "moved": stage.moved,
+            "compared": stage.compared,
             "seconds": stage.seconds,
             "t": stage.adam.t,
             "origin": grid.origin,

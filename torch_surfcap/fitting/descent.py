@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 
 from torch_surfcap import ops
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.fitting.budget import gradient_groups
+from torch_surfcap.fitting.gathered import GatheredGradient
 from torch_surfcap.fitting.rays import find_ranges
 from torch_surfcap.fitting.settings import FitSettings
 from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio
@@ -19,6 +21,7 @@ BEND = (
     0.4  # voxels^-1, the sum of curvatures above which bending costs linearly: edges and thin parts survive
 )
 
+RAY_ARGUMENTS = ("origins", "directions", "background", "target", "mask", "weight")
 RAY_LOSSES = ("photo", "sample", "mask")
 VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
 BALLOONING = VOXEL_LOSSES.index("ballooning")
@@ -35,32 +38,44 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     )
     store, grid, rays, rule = stage.store, stage.grid, stage.rays, stage.rule
     frame = grid.frame(*MISSING[settings.opacity])
-    bundle = (rays.origins, rays.directions)
-    seen = (rays.background, rays.target, rays.mask, rays.weight)
-    gradients = store.new_empty(gradient_groups(store.numel()), *store.shape)
+    arguments: dict[str, Any] = {
+        "voxels": store,
+        "table": grid.table,
+        "frame": frame,
+        **{name: getattr(rays, name) for name in RAY_ARGUMENTS},
+        **stage.march._asdict(),
+        "huber": loss.huber,
+        "weights": ray_weights,
+        "detach_sample": loss.detach_sample,
+        "rendered_sample": loss.sample_target == "rendered",
+    }
+    gathered = GatheredGradient(rays, grid, settings, stage.march) if settings.gradient == "gather" else None
+    groups = 0 if gathered else gradient_groups(store.numel())
+    gradients = store.new_empty(groups, *store.shape)
     watch = Stopwatch(stage.seconds)
     while not rule.ended:
         if stage.moved >= REFRESH:
             stage.moved = 0.0
-            rays.ranges = find_ranges(store, grid, settings.opacity, stage.march, *bundle)
+            rays.ranges = find_ranges(
+                store, grid, settings.opacity, stage.march, rays.origins, rays.directions
+            )
+            if gathered:
+                gathered.lay_out()
             watch.lap("ranges")
-        shift = (torch.rand(len(rays), generator=studio.generator) - 0.5) * settings.descent.jitter
-        ray_losses, gradient, color, transmittance = ops.photometric_step(
-            store,
-            grid.table,
-            frame,
-            *bundle,
-            shift,
-            *seen,
-            **stage.march._asdict(),
-            huber=loss.huber,
-            weights=ray_weights,
-            detach_sample=loss.detach_sample,
-            rendered_sample=loss.sample_target == "rendered",
-            ranges=rays.ranges,
-            gradients=gradients,
-        )
-        watch.lap("march")
+        lattices = len(rays.cameras) if gathered else len(rays)
+        shift = (torch.rand(lattices, generator=studio.generator) - 0.5) * settings.descent.jitter
+        arguments["shift"] = gathered.per_ray(shift) if gathered else shift
+        cosines: dict[str, float] = {}
+        if gathered:
+            ray_losses, gradient, color, transmittance = gathered.step(arguments, shift, watch)
+            if rule.scale != stage.compared:
+                cosines, stage.compared = gathered.cosines(arguments), rule.scale
+                watch.lap("compare")
+        else:
+            ray_losses, gradient, color, transmittance = ops.photometric_step(
+                **arguments, ranges=rays.ranges, gradients=gradients
+            )
+            watch.lap("march")
         if loss.anneal:  # the bias helps to find a surface, and then stands in its way
             voxel_weights[BALLOONING] = loss.ballooning * rule.scale
         voxel_losses = ops.voxel_terms(
@@ -77,4 +92,4 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
         weights = losses.new_tensor([*ray_weights, *voxel_weights])
         row = {"iteration": float(rule.count), "loss": float(losses @ weights), "rate": rule.scale}
         rule.goes_on(row["loss"])
-        yield row | dict(zip(RAY_LOSSES + VOXEL_LOSSES, losses.tolist(), strict=True))
+        yield row | dict(zip(RAY_LOSSES + VOXEL_LOSSES, losses.tolist(), strict=True)) | cosines

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.arrays import float_tensor
+from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.field.hull import grown
@@ -28,7 +29,8 @@ class RayBatch:
     """R rays and their observations, float32, in the order of cameras and pixel blocks.
 
     origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them;
-    camera_starts: [N + 1], where each camera's rays begin; pixels: [R] int32, row-major number in the camera's picture.
+    camera_starts: [N + 1], where each camera's rays begin; pixels: [R] int32, row-major number in the camera's picture;
+    cameras: of the pictures.
     """
 
     origins: Tensor
@@ -40,6 +42,7 @@ class RayBatch:
     ranges: tuple[Tensor, Tensor]
     camera_starts: list[int]
     pixels: Tensor
+    cameras: Cameras
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -142,7 +145,18 @@ def rays_of(
         starts.append(starts[-1] + len(index))
     origins, directions, mask, weight = (torch.cat(c).contiguous() for c in zip(*parts, strict=True))
     target, background = torch.empty_like(origins), torch.empty_like(origins)
-    return RayBatch(origins, directions, target, background, mask, weight, ranges, starts, torch.cat(pixels))
+    return RayBatch(
+        origins,
+        directions,
+        target,
+        background,
+        mask,
+        weight,
+        ranges,
+        starts,
+        torch.cat(pixels),
+        capture.cameras,
+    )
 
 
 def pixels_per_voxel(capture: Capture, grid: TileGrid) -> Tensor:

@@ -77,6 +77,9 @@ class FitSettings:
     start:     "hull": the first field falls off at the hull's surface; "constant": a transparency is the same fog inside
     upscale:   "plain" or "sqrt": a transparency at a change of level stays, or becomes its root, so that two fine voxels
                stop as much light as the coarse one did
+    gradient:  "scatter", the exact gradient of the ray terms, or "gather", the paper's eq. 19: close to it, and without
+               sums that threads share
+    lattice:   32 or 8, bits of a number of the samples' gradients that "gather" keeps
     threshold: opacity value of the surface. smooth: rounds of Taubin smoothing of the mesh. specks: pieces under this
                fraction of the largest one's area are removed
     losses, descent: see there; `losses=dict(mask=0.1)` changes one entry
@@ -93,6 +96,8 @@ class FitSettings:
     upscale: str = "plain"
     seed: int = 0
     device: str = "cpu"
+    gradient: str = "scatter"
+    lattice: int = 32
     threshold: float | None = None
     smooth: int = 5
     specks: float = 0.01
@@ -129,6 +134,8 @@ class FitSettings:
             ("levels", settings.levels is None or settings.levels >= 1),
             *((name, getattr(settings, name) in words) for name, words in CHOICES.items()),
             ("losses.sample_target", settings.losses.sample_target in SAMPLE_TARGETS),
+            ("gradient", settings.gradient in ("scatter", "gather")),
+            ("lattice", settings.lattice in (32, 8)),
         ):
             if not sound:
                 raise ValueError(

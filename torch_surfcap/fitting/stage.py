@@ -59,7 +59,8 @@ class Stage:
     """One level of the fit.
 
     number: of the level, from 0. level: its plan. grid, store: the field, padded records [T, 4, 4, 4, P]. moved:
-    iterations at full rate since the integration ranges were found. seconds: spent per kind of work.
+    iterations at full rate since the integration ranges were found. compared: the rate at which the gathered gradient
+    was held against the exact one last. seconds: spent per kind of work.
     """
 
     number: int
@@ -71,6 +72,7 @@ class Stage:
     adam: TileAdam
     rule: Plateau
     moved: float = 0.0
+    compared: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
 
 

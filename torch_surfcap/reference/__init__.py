@@ -21,7 +21,18 @@ from .rays import (
     photometric_step,
     visibility,
 )
-from .store import INSIDE, OUTSIDE, TILE, dense, nonempty_cells, sample_backward, sample_forward, upscale
+from .slots import coded, gather_gradient, photometric_lattice
+from .store import (
+    INSIDE,
+    OUTSIDE,
+    TILE,
+    corners,
+    dense,
+    nonempty_cells,
+    sample_backward,
+    sample_forward,
+    upscale,
+)
 from .voxels import adam_step, huber_norm, soft_hull, voxel_terms
 
 __all__ = [
@@ -32,7 +43,10 @@ __all__ = [
     "TILE",
     "TRANSPARENCY",
     "adam_step",
+    "coded",
+    "corners",
     "dense",
+    "gather_gradient",
     "harmonics",
     "huber_norm",
     "integration_ranges",
@@ -40,6 +54,7 @@ __all__ = [
     "march_backward",
     "march_forward",
     "nonempty_cells",
+    "photometric_lattice",
     "photometric_step",
     "sample_backward",
     "sample_forward",

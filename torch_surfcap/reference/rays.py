@@ -44,7 +44,7 @@ class March(NamedTuple):
     """Samples of R rays on a lattice of K distances; after a ray's end and in empty cells a = 1."""
 
     t: Tensor  # [R,K] distance from the origin
-    value: Tensor  # [R,K] opacity value
+    read: Tensor  # [R,K,4] opacity value and colour as read from the voxels
     a: Tensor  # [R,K] transparency
     color: Tensor  # [R,K,3]
     transmittance: Tensor  # [R,K+1] exclusive: what is left before sample k, and at the end
@@ -55,6 +55,11 @@ class March(NamedTuple):
     @property
     def weight(self) -> Tensor:
         return (1 - self.a) * self.transmittance[:, :-1]
+
+    @property
+    def value(self) -> Tensor:
+        """[R,K] opacity value."""
+        return self.read[..., 0]
 
 
 def march(
@@ -87,7 +92,8 @@ def march(
     basis = BASIS_OF_PITCH[voxels.shape[-1]]
     coefficients = record[..., 1 : 1 + 3 * basis].unflatten(-1, (basis, 3))
     color = torch.einsum("rl,rklc->rkc", harmonics(directions, basis), coefficients)
-    value = record[..., 0]
+    read = torch.cat([record[..., :1], color], -1)
+    value, color = read[..., 0], read[..., 1:]
     if opacity == TRANSPARENCY:
         a = value
     else:
@@ -105,7 +111,7 @@ def march(
     alive = torch.cumprod(torch.nn.functional.pad(left[:, :-1], (1, 0), value=True), 1).bool()
     a = torch.where(alive, a, 1)
     transmittance = torch.cat([a.new_ones(len(a), 1), torch.cumprod(a, 1)], 1)
-    return March(t, value, a, color, transmittance, active & alive, index, corner)
+    return March(t, read, a, color, transmittance, active & alive, index, corner)
 
 
 def march_forward(
@@ -193,15 +199,32 @@ def photometric_step(
     """
     leaf = voxels.detach().requires_grad_()
     m = march(leaf, table, frame, origins, directions, shift, opacity, slope, step, stop)
-    left = m.transmittance[:, -1]
-    color = (m.weight[..., None] * m.color).sum(1) + left[:, None] * background
-    w = m.weight.detach() if detach_sample else m.weight
-    photo = huber_norm(color - target, huber).sum(-1)
-    own_target = color.detach() if rendered_sample else target
-    sample = (w * huber_norm(m.color - own_target[:, None], huber).sum(-1)).sum(1)
-    losses = torch.stack([(weight * term).sum() for term in (photo, sample, (left - (1 - mask)) ** 2)])
+    losses, color, left = ray_losses(
+        m, background, target, mask, weight, huber, detach_sample, rendered_sample
+    )
     (gradient,) = torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)
     return losses.detach().double(), gradient, color.detach(), left.detach()
+
+
+def ray_losses(
+    m: March,
+    background: Tensor,
+    target: Tensor,
+    mask: Tensor,
+    weight: Tensor,
+    huber: float,
+    detach: bool,
+    rendered: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Losses [3], colour [R,3] and transmittance [R] of marched rays; see `photometric_step`."""
+    left = m.transmittance[:, -1]
+    color = (m.weight[..., None] * m.color).sum(1) + left[:, None] * background
+    w = m.weight.detach() if detach else m.weight
+    photo = huber_norm(color - target, huber).sum(-1)
+    own_target = color.detach() if rendered else target
+    sample = (w * huber_norm(m.color - own_target[:, None], huber).sum(-1)).sum(1)
+    terms = (photo, sample, (left - (1 - mask)) ** 2)
+    return torch.stack([(weight * term).sum() for term in terms]), color, left
 
 
 def visibility(

@@ -1,0 +1,200 @@
+// The gathered gradient (paper, section 3.3 and eq. 19): the rays of a camera leave the gradient by what each of their
+// samples read in a slot, and every voxel reads, from each camera, the 8 slots around it. Nothing adds to memory that
+// another thread writes, so no order of the sums is left to chance.
+//
+// All rays of a camera take their samples at the same distances t_k. On its lattice (u, v, k) a voxel at the distance d
+// stands at its own pixel position and k = d/step - 1/2 - shift. The samples of a pixel grid fill space with
+//   det(K) d / (z^3 step)
+// samples per volume (z the depth along the optical axis; on it, focal^2/(d^2 step)), so with lerp over 4 pixels x 2 k
+//   dL/db_lm  ~  sum over cameras of  Y_lm(camera -> voxel) * (voxel^3 * samples per volume) * lerp(dL/dc),
+// and the same without Y for the opacity value. It is the exact gradient, sum over samples of their trilinear weight at
+// the voxel times dL/dc, for a field of dL/dc that is smooth over voxels and samples.
+#pragma once
+
+#include <climits>
+
+#include "march.h"
+#include "minifloat.h"
+
+namespace surfcap {
+inline namespace SURFCAP_ISA {
+
+template <class Real> SURFCAP_HD void store_slot(Real* slot, const Pack<Real, 4>& g) { store<Real, 4>(slot, g); }
+template <class Real> SURFCAP_HD void store_slot(uint8_t* slot, const Pack<Real, 4>& g) {
+  for (int i = 0; i < 4; ++i) slot[i] = encode_e5m2(float(g[i]));
+}
+template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const Real* slot) { return load<Real, 4>(slot); }
+template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const uint8_t* slot) {
+  return convert_pack<Real, 4, float>(decode_e5m2(slot));
+}
+
+// Writes the samples' gradients into their rays' rows, which are cleared first: a ray may end before its row does.
+// Memory rule: writes.
+template <class Real, class Slot> struct ToSlots {
+  const SlotRows<Real>& rows;
+  Slot* slots;  // [S, 4]
+
+  static constexpr const Real* prefetched() { return nullptr; }
+
+  template <class Walk> SURFCAP_HD auto sink(const Walk&, int64_t ray) const {
+    Slot* const row = slots + 4 * rows.starts[ray];
+    const int64_t count = rows.starts[ray + 1] - rows.starts[ray];
+    const int32_t first = rows.first[ray];
+    const Real scale = rows.scale;
+    for (int64_t i = 0; i < 4 * count; ++i) row[i] = Slot(0);
+    return [=](int, const auto& sample, const Pack<Real, 4>& g) {
+      const int64_t at = int64_t(sample.k) - first;
+      if (at >= 0 && at < count) store_slot<Real>(row + 4 * at, scale * g);
+    };
+  }
+};
+
+// Where the voxels of a tile stand on one camera's lattice, kLanes voxels at a time: what they read and how.
+template <class Real> struct Stand {
+  const int32_t* corner[kLanes];                    // the upper left pixel's ray, in the camera's window
+  const int32_t* reach[kLanes];                     // of the rays around: least and one more than greatest k
+  Real right[kLanes], down[kLanes], after[kLanes];  // place between this pixel and its neighbours, between two samples
+  int32_t k[kLanes];                                // the sample before
+  Real way[3][kLanes], distance[kLanes];            // from the camera's centre
+  Real samples[kLanes];                             // per voxel; 0 where the voxel is behind the camera
+};
+
+template <class Real>
+SURFCAP_HD void find_stand(const Field<Real>& field, const int32_t* coordinate, int first,
+                           const SlotCameras<Real>& cameras, int64_t v, Stand<Real>& out) {
+  using Number = Pack<Real, kLanes>;
+  using Index = Pack<int32_t, kLanes>;
+  const int64_t *const window = cameras.windows + 4 * v, width = window[2], height = window[3];
+  const Real *const m = cameras.matrices + 9 * v, *const center = cameras.centers + 3 * v;
+  const Real voxel = Real(1) / field.per_unit;
+  const Real determinant =
+      m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) + m[2] * (m[3] * m[7] - m[4] * m[6]);
+  Number way[3], h[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    Real place[kLanes];
+    for (int l = 0; l < kLanes; ++l)
+      place[l] = Real(kTile * coordinate[axis] + (((first + l) >> (4 - 2 * axis)) & 3)) + Real(0.5);
+    way[axis] = voxel * load<Real, kLanes>(place) + (field.origin[axis] - center[axis]);
+    store<Real, kLanes>(out.way[axis], way[axis]);
+  }
+  for (int r = 0; r < 3; ++r) h[r] = m[3 * r] * way[0] + m[3 * r + 1] * way[1] + m[3 * r + 2] * way[2];
+  // Beyond the window's border a place is held to the border, whose pixels have no ray.
+  const auto along = [&](const Number& homogeneous, int64_t low, int64_t size, Real* fraction) {
+    const Number at = homogeneous / h[2] - Real(low) - Real(0.5);
+    const Number held = smaller_pack<Real, kLanes>(larger_pack<Real, kLanes>(at, zero_pack<Real, kLanes>()),
+                                                   fill_pack<Real, kLanes>(Real(size - 1)));
+    const Index base = smaller_pack<int32_t, kLanes>(convert_pack<int32_t, kLanes, Real>(held),
+                                                     fill_pack<int32_t, kLanes>(int32_t(size) - 2));
+    store<Real, kLanes>(fraction, held - convert_pack<Real, kLanes, int32_t>(base));
+    return base;
+  };
+  const Index column = along(h[0], window[0], width, out.right), row = along(h[1], window[1], height, out.down);
+  const Number squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2];
+  const Real filling = determinant * voxel * voxel * voxel / cameras.step;
+  const int64_t blocks = ((width - 1) >> kReachBits) + 1;
+  for (int l = 0; l < kLanes; ++l) {
+    const Real distance = std::sqrt(squared[l]), depth = h[2][l];
+    const Real k = larger(distance / cameras.step - Real(0.5) - cameras.shift[v], Real(0));
+    out.k[l] = int32_t(k);
+    out.after[l] = k - Real(out.k[l]);
+    out.distance[l] = distance;
+    out.samples[l] = depth > Real(0) ? filling * distance / (depth * depth * depth) : Real(0);
+    out.corner[l] = cameras.rays + cameras.offsets[v] + row[l] * width + column[l];
+    const int64_t block = (row[l] >> kReachBits) * blocks + (column[l] >> kReachBits);
+    out.reach[l] = cameras.reach + 2 * (cameras.reach_offsets[v] + block);
+  }
+}
+
+// One pixel's share in what a voxel reads: two samples of its ray, or one at the end of the row.
+template <class Real> struct Share {
+  int64_t before, after;  // slots
+  Real weight_before, weight_after;
+  int32_t voxel;  // in the tile
+};
+
+// Lists the shares in the voxels first..first + kLanes - 1 of the tile; returns their number, 4 kLanes at most.
+template <class Real>
+SURFCAP_HD int find_shares(const Stand<Real>& stand, int first, int64_t width, const SlotRows<Real>& rows,
+                           Share<Real>* shares) {
+  int found = 0;
+  for (int l = 0; l < kLanes; ++l) {
+    if (stand.k[l] + 1 < stand.reach[l][0] || stand.k[l] >= stand.reach[l][1]) continue;
+    for (int c = 0; c < 4; ++c) {
+      const int32_t ray = stand.corner[l][(c & 1) + (c >> 1) * width];
+      if (ray < 0) continue;
+      const int64_t start = rows.starts[ray], count = rows.starts[ray + 1] - start;
+      const int64_t at = int64_t(stand.k[l]) - rows.first[ray];
+      const Real weight =
+          (c & 1 ? stand.right[l] : Real(1) - stand.right[l]) * (c >> 1 ? stand.down[l] : Real(1) - stand.down[l]);
+      Share<Real>& share = shares[found];
+      share.before = start + larger<int64_t>(at, 0);
+      share.after = start + smaller<int64_t>(at + 1, count - 1);
+      share.weight_before = at >= 0 ? weight * (Real(1) - stand.after[l]) : Real(0);
+      share.weight_after = at + 1 < count ? weight * stand.after[l] : Real(0);
+      share.voxel = first + l;
+      found += at >= -1 && at < count;  // without a branch: every other one misses
+    }
+  }
+  return found;
+}
+
+// Fills the reach of one camera's window; `reach` is that of its first block.
+template <class Real>
+SURFCAP_HD void find_reach(const SlotCameras<Real>& cameras, const SlotRows<Real>& rows, int64_t v, int32_t* reach) {
+  const int64_t width = cameras.windows[4 * v + 2], height = cameras.windows[4 * v + 3];
+  const int64_t wide = ((width - 1) >> kReachBits) + 1, high = ((height - 1) >> kReachBits) + 1;
+  const int32_t* const rays = cameras.rays + cameras.offsets[v];
+  for (int64_t b = 0; b < wide * high; ++b, reach += 2) {
+    reach[0] = INT_MAX;
+    reach[1] = INT_MIN;
+    const int64_t left = (b % wide) << kReachBits, top = (b / wide) << kReachBits, side = (1 << kReachBits) + 1;
+    for (int64_t y = top; y < smaller(top + side, height); ++y)
+      for (int64_t x = left; x < smaller(left + side, width); ++x) {
+        const int32_t ray = rays[y * width + x];
+        if (ray < 0 || rows.starts[ray] == rows.starts[ray + 1]) continue;
+        reach[0] = smaller(reach[0], rows.first[ray]);
+        reach[1] = larger(reach[1], int32_t(rows.first[ray] + rows.starts[ray + 1] - rows.starts[ray]));
+      }
+  }
+}
+
+// The gradient of one tile's voxels, all cameras in their order. Memory rule: writes `gradient` [4, 4, 4, pitch].
+template <class Real, int Degree, class Slot>
+SURFCAP_HD void gather_tile(const Field<Real>& field, const int32_t* coordinate, const SlotCameras<Real>& cameras,
+                            const SlotRows<Real>& rows, const Slot* slots, Real* gradient) {
+  using R = Record<Degree>;
+  Stand<Real> stands[kTileVoxels / kLanes];
+  Share<Real> shares[4 * kTileVoxels + 1];
+  Pack<Real, 4> read[kTileVoxels];
+  for (int i = 0; i < kTileVoxels * R::kPitch; ++i) gradient[i] = Real(0);
+  for (int64_t v = 0; v < cameras.views; ++v) {
+    const int64_t width = cameras.windows[4 * v + 2];
+    if (width == 0) continue;
+    int count = 0;
+    for (int first = 0; first < kTileVoxels; first += kLanes) {
+      Stand<Real>& stand = stands[first / kLanes];
+      find_stand(field, coordinate, first, cameras, v, stand);
+      const int found = find_shares(stand, first, width, rows, shares + count);
+      for (const int end = count + found; count < end; ++count) __builtin_prefetch(slots + 4 * shares[count].before);
+    }
+    if (count == 0) continue;
+    for (int i = 0; i < kTileVoxels; ++i) read[i] = zero_pack<Real, 4>();
+    for (int s = 0; s < count; ++s)
+      read[shares[s].voxel] += shares[s].weight_before * load_slot<Real>(slots + 4 * shares[s].before) +
+                               shares[s].weight_after * load_slot<Real>(slots + 4 * shares[s].after);
+    for (int i = 0; i < kTileVoxels; ++i) {
+      const Stand<Real>& stand = stands[i / kLanes];
+      const int l = i % kLanes;
+      const Real nearness = Real(1) / stand.distance[l];
+      const Real direction[3] = {stand.way[0][l] * nearness, stand.way[1][l] * nearness, stand.way[2][l] * nearness};
+      const Coefficients<Real, Degree> by_record =
+          unfold<Real, Degree>(stand.samples[l] / rows.scale * read[i], basis_weights<Real, Degree>(direction));
+      Real* const to = gradient + i * R::kPitch;
+      for (int p = 0; p < R::kParts; ++p)
+        store<Real, R::kPart>(to + p * R::kPart, load<Real, R::kPart>(to + p * R::kPart) + by_record.part[p]);
+    }
+  }
+}
+
+}  // namespace SURFCAP_ISA
+}  // namespace surfcap

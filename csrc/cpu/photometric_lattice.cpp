@@ -1,0 +1,35 @@
+// photometric_lattice: photometric_step up to the gradients of the samples, which it leaves in the slots of their rays
+// (see core/slots.h). Every ray owns its row, so the rays need neither atomics nor buffers of their own.
+#include "photometric.h"
+
+namespace surfcap {
+
+constexpr int64_t kLossGroups = 64;  // sums of losses, so that the values do not depend on the threads
+
+template <class Real, class... Common>
+StepResult photometric_lattice_typed(const Tensor& starts, const Tensor& first, int64_t exponent, const Tensor& slots,
+                                     const Common&... common) {
+  const PhotometricArgument<Real> step(common...);
+  const SlotRowsArgument<Real> rows(starts, first, exponent, slots, step.rays.view.count);
+  void* const to = slots.mutable_data_ptr();
+  return photometric<Real>(
+      step, kLossGroups, 0, nullptr, [&](int64_t begin, int64_t end, double* losses, Real* color, Real* left, Real*) {
+        best_kernels<Real>().photometric_lattice(step.field.view, step.rays.view, step.settings, step.seen, step.loss,
+                                                 rows.view, rows.narrow, begin, end, losses, color, left, to);
+      });
+}
+
+StepResult photometric_lattice(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins,
+                               Tensor directions, Tensor shift, Tensor background, Tensor target, Tensor mask,
+                               Tensor weight, std::optional<Tensor> range_offsets, std::optional<Tensor> ranges,
+                               int64_t opacity, double slope, double step, double stop, double huber,
+                               std::vector<double> weights, bool detach_sample, bool rendered_sample, Tensor starts,
+                               Tensor first, int64_t exponent, Tensor slots) {
+  return SURFCAP_BY_TYPE(voxels, photometric_lattice_typed, starts, first, exponent, slots, voxels, table, frame,
+                         origins, directions, shift, background, target, mask, weight, range_offsets, ranges, opacity,
+                         slope, step, stop, huber, weights, detach_sample, rendered_sample);
+}
+
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("photometric_lattice", TORCH_BOX(&photometric_lattice)); }
+
+}  // namespace surfcap
