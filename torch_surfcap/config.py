@@ -97,6 +97,9 @@ class Config:
     voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
     opacity: str | None = _one_of(None, *LOSSES)  # what a voxel stores
+    storage: int = _one_of(32, 32, 16, 8)  # bits of a coefficient during the fit, and of each of its moments
+    rounding: str = _one_of("stochastic", "stochastic", "nearest")  # of coefficients of 16 or 8 bits
+    accumulator: int = _one_of(32, 32, 16)  # bits of the gradients' sums; 16 needs storage=16 or 8
     losses: LossesConfig = field(default_factory=LossesConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
@@ -144,6 +147,9 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "levels": config.levels,
         "box": None if config.data.box is None else tuple(config.data.box),
         "seed": config.seed,
+        "storage": config.storage,
+        "rounding": config.rounding,
+        "accumulator": config.accumulator,
         "threshold": config.mesh.threshold,
         "smooth": config.mesh.smooth,
         "specks": config.mesh.specks,

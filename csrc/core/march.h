@@ -36,10 +36,10 @@ template <class Real, class Opacity> struct Trace {
 };
 
 // The most samples a ray can have in this field, rounded up to whole groups of lanes, and one group to spare.
-template <class Real> SURFCAP_HD int64_t trace_capacity(const Field<Real>& field, Real step) {
+template <class Real> SURFCAP_HD int64_t trace_capacity(const Grid<Real>& grid, Real step) {
   Real squared = Real(0);
-  for (int i = 0; i < 3; ++i) squared += Real(kTile * field.n[i]) * Real(kTile * field.n[i]);
-  const int64_t longest = int64_t(std::ceil(std::sqrt(squared) / (step * field.per_unit))) + 2;
+  for (int i = 0; i < 3; ++i) squared += Real(kTile * grid.n[i]) * Real(kTile * grid.n[i]);
+  const int64_t longest = int64_t(std::ceil(std::sqrt(squared) / (step * grid.per_unit))) + 2;
   return (longest / kLanes + 2) * kLanes;
 }
 
@@ -54,7 +54,8 @@ template <class Real, int Degree, class Opacity> struct Walk {
   Pack<Real, kLanes> t;
   int count;  // samples set up and not yet gone through
 
-  SURFCAP_HD void start(const Field<Real>& field, const Lattice<Real>& samples, const Real* direction,
+  template <class Stored>
+  SURFCAP_HD void start(const Field<Real, Stored>& field, const Lattice<Real>& samples, const Real* direction,
                         const Trace<Real, Opacity>& room) {
     lattice = samples;
     weights = basis_weights<Real, Degree>(direction);
@@ -64,8 +65,9 @@ template <class Real, int Degree, class Opacity> struct Walk {
   }
 
   // `gradient`, where given, is what the walk back will add to: it is fetched meanwhile.
-  SURFCAP_HD void finish(const Field<Real>& field, const Real* missing_records, Real stop, const Opacity& opacity,
-                         const Real* gradient) {
+  template <class Stored, class Sum>
+  SURFCAP_HD void finish(const Field<Real, Stored>& field, const Code<Real, Degree, Stored>& code, Real stop,
+                         const Opacity& opacity, const Sum* gradient) {
     typename Opacity::State before = opacity.outside();
     Pack<Real, 4> color_before = zero_pack<Real, 4>();
     int k_before = -2;
@@ -73,7 +75,7 @@ template <class Real, int Degree, class Opacity> struct Walk {
       const Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
       int l = 0;
       for (bool alive = true; alive && l < count; ++l) {
-        Pack<Real, 4> color = fold<Real, Degree>(interpolate<Real, Degree>(field, missing_records, at, l), weights);
+        Pack<Real, 4> color = fold<Real, Degree>(interpolate(field, code, at, l), weights);
         Sample<Real, Opacity>& sample = trace.samples[ray.samples++];
         sample.starts_run = k[l] != k_before + 1;
         k_before = k[l];
@@ -96,14 +98,14 @@ template <class Real, int Degree, class Opacity> struct Walk {
         ray.transmittance *= sample.a;
         alive = !(ray.transmittance < stop);
       }
-      if (gradient) prefetch<Real, Degree>(gradient, at, l);
+      if (gradient) prefetch<Degree>(gradient, at, l);
       if (l < kLanes || ray.transmittance < stop) break;
       set_up(field);
     }
   }
 
  private:
-  SURFCAP_HD void set_up(const Field<Real>& field) {
+  template <class Stored> SURFCAP_HD void set_up(const Field<Real, Stored>& field) {
     // A ray of unit direction never fills its room; another one ends there.
     count = ray.samples + kLanes <= trace.capacity ? lattice.next(k, kLanes) : 0;
     if (count == 0) return;
@@ -112,16 +114,16 @@ template <class Real, int Degree, class Opacity> struct Walk {
     lattice.place(k, t, u);
     Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
     locate(field, u, at);
-    prefetch<Real, Degree>(field.voxels, at, count);
+    prefetch<Degree>(field.voxels, at, count);
   }
 };
 
 // `term(sample, dc)` returns a sample's r_k and sets lanes 1..3 of dc to the loss's derivative by its colour per unit
 // of weight w_k (what is left out of r_k does not move the weights). Gradients are scattered into `gradient`.
-template <class Real, int Degree, class Opacity, class Term>
+template <class Real, int Degree, class Opacity, class Term, class Sum>
 SURFCAP_HD void walk_back(const Trace<Real, Opacity>& trace, int samples, const Opacity& opacity,
-                          const Coefficients<Real, Degree>& weights, Real r_inf, const Term& term, Real* gradient,
-                          Real* spare) {
+                          const Coefficients<Real, Degree>& weights, Real r_inf, const Term& term, Sum* gradient,
+                          Sum* spare) {
   Real behind = r_inf;
   Pack<Real, 4> carried = zero_pack<Real, 4>();  // what the sample behind says about this sample's value and colour
   for (int i = samples - 1; i >= 0; --i) {

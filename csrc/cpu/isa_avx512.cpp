@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstdlib>
+#include <limits>
 #include <new>
 #include <type_traits>
 #include <vector>
@@ -16,6 +17,8 @@
 #else
 #pragma GCC target("avx512f,avx512bw,avx512dq,avx512vl,avx2,fma,bmi,bmi2,f16c")
 #endif
+#define SURFCAP_F16C  // macros such as __F16C__ do not follow the pragma in every compiler
+#define SURFCAP_AVX512
 #define SURFCAP_ISA avx512
 #define SURFCAP_ISA_NAME "avx512"
 #include "kernels_isa.h"

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.tiles import TileGrid
-from torch_surfcap.fitting.descent import gradient_groups
+from torch_surfcap.fitting.descent import CODE_GROUPS, gradient_groups
+from torch_surfcap.fitting.settings import FitSettings
 
 if TYPE_CHECKING:
     from torch_surfcap.fitting.levels import Level
@@ -35,23 +36,31 @@ class Budget:
     seconds: float
 
 
-def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor, opacity: str) -> Budget:
+def estimate(
+    capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor, settings: FitSettings
+) -> Budget:
     """The budget of a fit whose first level has this grid: surfaces grow by 4 per level, and so do pictures."""
     assert capture.masks is not None
     pixels = sum(float(mask.sum()) for mask in capture.masks)
     pitch = store.shape[-1]
-    area = _surface_tiles(grid, store[..., 0] < SURFACE[opacity])
+    area = _surface_tiles(grid, store[..., 0] < SURFACE[settings.opacity])
     level_bytes, samples = [], 0.0
     for number, level in enumerate(plan):
         tiles = len(store) if number == 0 else TILES_PER_AREA * area * 4**number
         numbers = int(tiles * ops.TILE**3 * pitch)
         rays = RAY_MARGIN * pixels / 4**level.halvings
-        level_bytes.append(int(4 * numbers * (3 + gradient_groups(numbers)) + BYTES_PER_RAY * rays))
+        level_bytes.append(int(bytes_per_number(numbers, settings) * numbers + BYTES_PER_RAY * rays))
         samples += rays * level.iterations * SAMPLES_PER_RAY
     return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
 
 
 LESS = "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"
+
+
+def bytes_per_number(numbers: int, settings: FitSettings) -> float:
+    """What each of so many numbers of a field takes in training: value, two moments, partial gradients."""
+    groups = gradient_groups(numbers) if settings.storage == 32 else CODE_GROUPS
+    return (3 * settings.storage + groups * settings.accumulator) / 8
 
 
 def shortage(needed: int, remedy: str = LESS) -> str | None:

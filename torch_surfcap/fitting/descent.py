@@ -21,6 +21,7 @@ from torch_surfcap.fitting.settings import FitSettings
 REFRESH = 8.0  # iterations at full rate after which the integration ranges are found anew: less than a voxel of motion
 GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
 GROUPS = (4, 32)  # fewest, most
+CODE_GROUPS = 2  # the same beside codes, whose reason is to save memory
 PARSIMONY_HUBER = 0.1
 BEND = (
     0.4  # voxels^-1, the sum of curvatures above which bending costs linearly: edges and thin parts survive
@@ -76,6 +77,12 @@ def gradient_groups(numbers: int) -> int:
     return max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
 
 
+def partial_gradients(store: Tensor, accumulator: int) -> Tensor:
+    """Memory for the partial gradients [groups, T, 4, 4, 4, P] of a field of floats or codes, in so many bits."""
+    groups = gradient_groups(store.numel()) if store.is_floating_point() else CODE_GROUPS
+    return torch.empty(groups, *store.shape, dtype={32: torch.float32, 16: torch.float16}[accumulator])
+
+
 def descend(
     store: Tensor,
     grid: TileGrid,
@@ -100,8 +107,9 @@ def descend(
     frame = grid.frame(*MISSING[settings.opacity])
     bundle = (rays.origins, rays.directions)
     seen = (rays.background, rays.target, rays.mask, rays.weight)
-    gradients = store.new_empty(gradient_groups(store.numel()), *store.shape)
-    adam = TileAdam(store, settings.opacity, settings.descent)
+    gradients = partial_gradients(store, settings.accumulator)
+    stochastic = settings.rounding == "stochastic"
+    adam = TileAdam(store, settings.opacity, settings.descent, settings.seed, stochastic)
     rule = Plateau(limit=3 * iterations)
     watch = Stopwatch(seconds)
     goes_on, moved = True, 0.0

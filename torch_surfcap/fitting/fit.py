@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torch_surfcap import ops
+from torch_surfcap import codes, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import prepare
 from torch_surfcap.errors import InputError
-from torch_surfcap.field.field import SLOPE, SurfaceField
+from torch_surfcap.field.field import MISSING, SLOPE, SurfaceField
 from torch_surfcap.fitting.budget import Budget, estimate, shortage
 from torch_surfcap.fitting.descent import Stopwatch, descend
 from torch_surfcap.fitting.levels import Level, first_field, next_level, plan_levels, subject_box
@@ -90,7 +90,7 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
     backdrop = choose_backdrop(capture)
     grid, store = first_field(pictures[plan[0].halvings], box, plan[0].voxel_size, s.opacity, degree)
     watch.lap("hull")
-    budget = estimate(capture, plan, grid, store, s.opacity)
+    budget = estimate(capture, plan, grid, store, s)
     report(Progress(0, len(plan), plan[0], 0, {}, budget))
 
     history: list[dict[str, float]] = []
@@ -109,7 +109,9 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
         spent: dict[str, float] = {}
         level_watch = Stopwatch(spent)
         if rays is not None and march is not None:
+            store = codes.decode(store, *MISSING[s.opacity])
             grid, store = next_level(grid, store, s.opacity, rays, march)
+        store = codes.encode(store, *MISSING[s.opacity], s.storage)
         step = s.descent.last_step if number == len(plan) - 1 else s.descent.step
         march = March(ops.OPACITY[s.opacity], SLOPE, step * level.voxel_size, s.descent.stop)
         rays = gather_rays(pictures[level.halvings], store, grid, s.opacity, march, backdrop)
@@ -119,7 +121,7 @@ def fit(capture: Capture, progress: Callable[[Progress], None] | None = None, **
             report(Progress(number, len(plan), level, len(store) * ops.TILE**3, row))
         by_level.append(spent)
     watch.lap("fit")
-    surface = SurfaceField(store, grid, s.opacity)
+    surface = SurfaceField(codes.decode(store, *MISSING[s.opacity]), grid, s.opacity)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:

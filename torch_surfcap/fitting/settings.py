@@ -57,6 +57,9 @@ class FitSettings:
     box:       (x0, y0, z0, x1, y1, z1) around the subject; found by default
     threshold: opacity value of the surface. smooth: rounds of Taubin smoothing of the mesh. specks: pieces under this
                fraction of the largest one's area are removed
+    storage:   bits of a coefficient during the fit, 32, 16 or 8, and of each of its moments
+    rounding:  of narrow coefficients, "stochastic" or "nearest"
+    accumulator: bits of the gradients' sums; 32, or 16 where storage is less than 32
     losses, descent: see there; `losses=dict(mask=0.1)` changes one entry
     """
 
@@ -70,6 +73,9 @@ class FitSettings:
     threshold: float | None = None
     smooth: int = 5
     specks: float = 0.01
+    storage: int = 32
+    rounding: str = "stochastic"
+    accumulator: int = 32
     losses: Losses = field(default_factory=Losses)
     descent: Descent = field(default_factory=Descent)
 
@@ -93,6 +99,9 @@ class FitSettings:
         for name, sound in (
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
             ("voxel", settings.voxel is None or settings.voxel > 0),
+            ("storage", settings.storage in (32, 16, 8)),
+            ("rounding", settings.rounding in ("stochastic", "nearest")),
+            ("accumulator", settings.accumulator in ((32,) if settings.storage == 32 else (32, 16))),
             ("levels", settings.levels is None or settings.levels >= 1),
         ):
             if not sound:

@@ -1,0 +1,88 @@
+// How fields and gradients narrower than a float are read and written.
+//
+// A code q of 8 or 16 bits stands for low + q (high - low)/steps. An opacity value lies between the two boundary
+// values, a constant colour in [0, 1], any other coefficient in [-1, 1]; one code is left unused, so that steps is even
+// and zero has a code wherever the range is symmetric. Since the weights of a trilinear read sum to one, it reads codes
+// and decodes their mean.
+#pragma once
+
+#include <limits>
+#include <type_traits>
+
+#include "harmonics.h"
+#include "minifloat.h"
+
+namespace surfcap {
+inline namespace SURFCAP_ISA {
+
+template <class Stored> constexpr float kSteps = float(std::numeric_limits<Stored>::max()) - 1;
+template <class Sum> constexpr int kSumScale = 1;  // what sums are multiplied with
+template <> constexpr int kSumScale<Half> = 1024;  // a fit's gradients lie under 1 and matter above 1e-8
+
+// N consecutive stored numbers as what one computes with, not yet decoded.
+template <class Real, int N, class Stored> SURFCAP_HD Pack<Real, N> load_as(const Stored* from) {
+  if constexpr (std::is_same_v<Stored, Real>)
+    return load<Real, N>(from);
+  else
+    return convert_pack<Real, N, int32_t>(convert_pack<int32_t, N, Stored>(load<Stored, N>(from)));
+}
+
+// Adds to N consecutive sums, in their scale; those of 16 bits are rounded to the nearest.
+template <class Real, int N, class Sum> SURFCAP_HD void add_to(Sum* to, const Pack<Real, N>& x) {
+  if constexpr (std::is_same_v<Sum, Real>)
+    store<Real, N>(to, load<Real, N>(to) + x);
+  else
+    to_halves<N>(from_halves<N>(to) + x, to);
+}
+
+template <class Real, class Sum> SURFCAP_HD void add_to(Sum* to, Real x) {
+  if constexpr (std::is_same_v<Sum, Real>)
+    *to += x;
+  else
+    *to = to_half(from_half(*to) + x);
+}
+
+// The code of the records of one field: value = low + code * scale. `missing` are the records that missing tiles read,
+// outside, then inside: black, in codes.
+template <class Real, int Degree, class Stored> struct Code {
+  using R = Record<Degree>;
+  static constexpr bool kNarrow = !std::is_same_v<Stored, Real>;
+  Real low[R::kPitch], scale[R::kPitch];
+  Real missing[2 * R::kPitch];
+
+  SURFCAP_HD explicit Code(const Grid<Real>& grid) {
+    for (int i = 0; i < R::kPitch; ++i) {
+      low[i] = i == 0 ? grid.missing[1] : i > 3 && i < R::kCoefficients ? Real(-1) : Real(0);
+      const Real high = i == 0 ? grid.missing[0] : i < R::kCoefficients ? Real(1) : Real(0);
+      if constexpr (kNarrow) {
+        scale[i] = (high - low[i]) / kSteps<Stored>;
+        const Real black = low[i] < Real(0) ? Real(0.5) * kSteps<Stored> : Real(0);
+        missing[i] = i == 0 ? kSteps<Stored> : black;
+        missing[R::kPitch + i] = i == 0 ? Real(0) : black;
+      } else {
+        missing[i] = i == 0 ? grid.missing[0] : Real(0);
+        missing[R::kPitch + i] = i == 0 ? grid.missing[1] : Real(0);
+      }
+    }
+  }
+
+  // Numbers p * kPart .. of a record, or of a mean of records.
+  SURFCAP_HD Pack<Real, R::kPart> decode(const Pack<Real, R::kPart>& codes, int p) const {
+    if constexpr (kNarrow)
+      return load<Real, R::kPart>(low + p * R::kPart) + codes * load<Real, R::kPart>(scale + p * R::kPart);
+    else
+      return codes;
+  }
+};
+
+// The opacity value of a voxel alone.
+template <class Real, class Stored> SURFCAP_HD Real opacity_value(const Field<Real, Stored>& field, int64_t voxel) {
+  const Stored stored = field.voxels[voxel * field.pitch];
+  if constexpr (std::is_same_v<Stored, Real>)
+    return stored;
+  else
+    return field.missing[1] + Real(stored) * ((field.missing[0] - field.missing[1]) / kSteps<Stored>);
+}
+
+}  // namespace SURFCAP_ISA
+}  // namespace surfcap
