@@ -59,6 +59,8 @@ SURFCAP_HD void adam_codes(Stored* value, const Sum* gradient, MomentOf<Stored>*
     rate[i] = span > 0 ? adam.rate[i % Pitch] * adam.correction1 * kTop / span : 0.0f;
   }
   const float correction2 = std::sqrt(adam.correction2), epsilon = adam.epsilon * float(kSumScale<Half>);
+  const bool stochastic = adam.stochastic;
+  const uint32_t key = adam.key;
   for (int64_t at = begin; at < end; at += kRow) {
     Row g;
     if constexpr (std::is_same_v<Sum, Half>)
@@ -68,16 +70,19 @@ SURFCAP_HD void adam_codes(Stored* value, const Sum* gradient, MomentOf<Stored>*
     const Row old = root_moment<kRow>(second + at);
     const Row m = adam.beta1 * first_moment<kRow>(first + at) + (1 - adam.beta1) * g;
     const Row v = adam.beta2 * old * old + (1 - adam.beta2) * g * g;
+    const Row rates = load<float, kRow>(rate + at % kPeriod);
     float root[kRow];
     uint32_t noise[kRow];
+    int32_t code[kRow];
+    store<int32_t, kRow>(code, widened<kRow>(value + at));
     for (int i = 0; i < kRow; ++i) {
-      noise[i] = noise_of(uint32_t(at + i), adam.key);
+      noise[i] = noise_of(uint32_t(at + i), key);
       root[i] = std::sqrt(v[i]);
-      const float step = clamped(rate[at % kPeriod + i] * m[i] / (root[i] * correction2 + epsilon), -kTop, kTop);
-      const float up = adam.stochastic ? float(noise[i] >> 16) * 0x1p-16f : 0.5f;
-      const int32_t code = int32_t(value[at + i]) + int32_t(std::floor(up - step));
-      value[at + i] = Stored(clamped<int32_t>(code, 0, int32_t(kTop)));
+      const float step = clamped(rates[i] * m[i] / (root[i] * correction2 + epsilon), -kTop, kTop);
+      const float up = stochastic ? float(int32_t(noise[i] >> 16)) * 0x1p-16f : 0.5f;
+      code[i] = clamped<int32_t>(code[i] + int32_t(std::floor(up - step)), 0, int32_t(kTop));
     }
+    for (int i = 0; i < kRow; ++i) value[at + i] = Stored(code[i]);
     keep_moments<kRow>(m, load<float, kRow>(root), noise, first + at, second + at);
   }
 }

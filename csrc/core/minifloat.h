@@ -26,7 +26,7 @@ SURFCAP_HD uint32_t noise_of(uint32_t index, uint32_t key) {
 // To the nearest half, ties to even.
 SURFCAP_HD Half to_half(float x) {
   x = clamped(x, -kMostHalf, kMostHalf);
-#if defined(SURFCAP_F16C)
+#if defined(SURFCAP_AVX2)
   return {uint16_t(_cvtss_sh(x, _MM_FROUND_TO_NEAREST_INT))};
 #else
   uint32_t bits;
@@ -45,7 +45,7 @@ SURFCAP_HD Half to_half(float x) {
 }
 
 SURFCAP_HD float from_half(Half h) {
-#if defined(SURFCAP_F16C)
+#if defined(SURFCAP_AVX2)
   return _cvtsh_ss(h.bits);
 #else
   constexpr float kBias = 0x1p112f;  // 2 to the difference of the biases
@@ -58,12 +58,12 @@ SURFCAP_HD float from_half(Half h) {
 
 // Rows of N numbers, N a multiple of 4.
 template <int N> SURFCAP_HD void to_halves(const Pack<float, N>& x, Half* to) {
-#if defined(SURFCAP_F16C)
+#if defined(SURFCAP_AVX2)
   const Pack<float, N> most = fill_pack<float, N>(kMostHalf);
   const Pack<float, N> held = smaller_pack<float, N>(larger_pack<float, N>(x, zero_pack<float, N>() - most), most);
 #if defined(SURFCAP_AVX512)
   if constexpr (N == 16) {
-    _mm256_storeu_si256((__m256i_u*)to, _mm512_cvtps_ph(__m512(held), _MM_FROUND_TO_NEAREST_INT));
+    _mm256_storeu_si256((__m256i_u*)to, _mm512_maskz_cvtps_ph(0xffff, __m512(held), _MM_FROUND_TO_NEAREST_INT));
     return;
   }
 #endif
@@ -78,10 +78,11 @@ template <int N> SURFCAP_HD void to_halves(const Pack<float, N>& x, Half* to) {
 
 template <int N> SURFCAP_HD Pack<float, N> from_halves(const Half* from) {
 #if defined(SURFCAP_AVX512)
-  if constexpr (N == 16) return Pack<float, N>(_mm512_cvtph_ps(_mm256_loadu_si256((const __m256i_u*)from)));
+  if constexpr (N == 16)
+    return Pack<float, N>(_mm512_maskz_cvtph_ps(0xffff, _mm256_loadu_si256((const __m256i_u*)from)));
 #endif
   float row[N];
-#if defined(SURFCAP_F16C)
+#if defined(SURFCAP_AVX2)
   for (int i = 0; i < N; i += 4) _mm_storeu_ps(row + i, _mm_cvtph_ps(_mm_loadl_epi64((const __m128i*)(from + i))));
 #else
   for (int i = 0; i < N; ++i) row[i] = from_half(from[i]);

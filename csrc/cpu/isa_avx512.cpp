@@ -17,7 +17,7 @@
 #else
 #pragma GCC target("avx512f,avx512bw,avx512dq,avx512vl,avx2,fma,bmi,bmi2,f16c")
 #endif
-#define SURFCAP_F16C  // macros such as __F16C__ do not follow the pragma in every compiler
+#define SURFCAP_AVX2  // __AVX2__ and its like do not follow the pragma in every compiler
 #define SURFCAP_AVX512
 #define SURFCAP_ISA avx512
 #define SURFCAP_ISA_NAME "avx512"

@@ -15,6 +15,7 @@ from torch_surfcap import FitResult, InputError, fit
 from torch_surfcap.fitting import fit as fit_function
 from torch_surfcap.fitting.budget import estimate, shortage
 from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
+from torch_surfcap.fitting.settings import FitSettings
 
 QUICK: dict[str, Any] = {"levels": 2, "voxel": 1 / 40}
 
@@ -113,7 +114,7 @@ def test_budget_grows_with_levels_and_degree() -> None:
     bytes_by_degree = []
     for degree in (0, 1, 2):
         grid, store = first_field(capture, box, plan[0].voxel_size, "distance", degree)
-        budget = estimate(capture, plan, grid, store, "distance")
+        budget = estimate(capture, plan, grid, store, FitSettings())
         assert budget.level_bytes == sorted(budget.level_bytes)
         assert budget.level_bytes[0] > 4 * 3 * store.numel()
         bytes_by_degree.append(budget.level_bytes[-1])

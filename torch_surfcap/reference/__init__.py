@@ -9,6 +9,7 @@ Store: `voxels` [T,4,4,4,P] as [tile, x, y, z, coefficient], P = 4, 16, 32 for S
 value, inside value].
 """
 
+from .codes import decoded
 from .rays import (
     BASIS_OF_PITCH,
     DISTANCE,
@@ -32,6 +33,7 @@ __all__ = [
     "TILE",
     "TRANSPARENCY",
     "adam_step",
+    "decoded",
     "dense",
     "harmonics",
     "huber_norm",
