@@ -6,7 +6,6 @@
 // and decodes their mean.
 #pragma once
 
-#include <limits>
 #include <type_traits>
 
 #include "harmonics.h"
@@ -15,7 +14,9 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-template <class Stored> constexpr float kSteps = float(std::numeric_limits<Stored>::max()) - 1;
+template <class Stored> constexpr float kSteps = 0;  // numbers are no codes
+template <> constexpr float kSteps<uint8_t> = 254;
+template <> constexpr float kSteps<uint16_t> = 65534;
 template <class Sum> constexpr int kSumScale = 1;  // what sums are multiplied with
 template <> constexpr int kSumScale<Half> = 1024;  // a fit's gradients lie under 1 and matter above 1e-8
 
@@ -57,27 +58,25 @@ template <class Real, class Sum> SURFCAP_HD void add_to(Sum* to, Real x) {
 }
 
 // The code of the records of one field: value = low + code * scale. `missing` are the records that missing tiles read,
-// outside, then inside: black, in codes.
+// outside, then inside: black.
 template <class Real, int Degree, class Stored> struct Code {
   using R = Record<Degree>;
   static constexpr bool kNarrow = !std::is_same_v<Stored, Real>;
   Real low[R::kPitch], scale[R::kPitch];
-  Real missing[2 * R::kPitch];
+  Stored missing[2 * R::kPitch];
 
   SURFCAP_HD explicit Code(const Grid<Real>& grid) {
     for (int i = 0; i < R::kPitch; ++i) {
-      low[i] = i == 0 ? grid.missing[1] : i > 3 && i < R::kCoefficients ? Real(-1) : Real(0);
-      const Real high = i == 0 ? grid.missing[0] : i < R::kCoefficients ? Real(1) : Real(0);
+      const bool opacity = i == 0, colored = i < R::kCoefficients, symmetric = colored && i > 3;
+      missing[i] = missing[R::kPitch + i] = Stored(0);
       if constexpr (kNarrow) {
-        scale[i] = (high - low[i]) / kSteps<Stored>;
-        const Real black = low[i] < Real(0) ? Real(0.5) * kSteps<Stored> : Real(0);
-        missing[i] = i == 0 ? kSteps<Stored> : black;
-        missing[R::kPitch + i] = i == 0 ? Real(0) : black;
-      } else {
-        missing[i] = i == 0 ? grid.missing[0] : Real(0);
-        missing[R::kPitch + i] = i == 0 ? grid.missing[1] : Real(0);
+        low[i] = opacity ? grid.missing[1] : symmetric ? Real(-1) : Real(0);
+        scale[i] = ((opacity ? grid.missing[0] : colored ? Real(1) : Real(0)) - low[i]) / kSteps<Stored>;
+        if (symmetric) missing[i] = missing[R::kPitch + i] = Stored(kSteps<Stored> / 2);
       }
     }
+    missing[0] = kNarrow ? Stored(kSteps<Stored>) : Stored(grid.missing[0]);
+    missing[R::kPitch] = kNarrow ? Stored(0) : Stored(grid.missing[1]);
   }
 
   // Numbers p * kPart .. of a record, or of a mean of records.

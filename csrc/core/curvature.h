@@ -21,7 +21,7 @@ SURFCAP_HD Real curvature_tile(const Field<Real, Stored>& field, int64_t cell, i
   // Of codes, less than half a step inside: what a bound decodes to may be off by rounding.
   const Real low_bound = smaller(field.missing[0], field.missing[1]),
              high_bound = larger(field.missing[0], field.missing[1]);
-  const Real hair = std::is_same_v<Stored, Real> ? Real(0) : Real(0.25) / kSteps<Stored> * (high_bound - low_bound);
+  const Real hair = kSteps<Stored> > 0 ? Real(0.25) / kSteps<Stored> * (high_bound - low_bound) : Real(0);
   const Real low = low_bound + hair, high = high_bound - hair;
 
   // bend: the norm's derivative by the Laplacian. Only rows with x and y in 1..6 are read with those around them, so

@@ -84,7 +84,7 @@ SURFCAP_HD Coefficients<Real, Degree> interpolate(const Field<Real, Stored>& fie
   using R = Record<Degree>;
   Coefficients<Real, Degree> sum;
   for (int p = 0; p < R::kParts; ++p) sum.part[p] = zero_pack<Real, R::kPart>();
-  const auto add = [&](const auto* record, Real weight) {
+  const auto add = [&](const Stored* record, Real weight) {
     for (int p = 0; p < R::kParts; ++p) sum.part[p] += weight * load_as<Real, R::kPart>(record + p * R::kPart);
   };
   if (at.least[l] >= 0) {
@@ -92,15 +92,8 @@ SURFCAP_HD Coefficients<Real, Degree> interpolate(const Field<Real, Stored>& fie
   } else {
     for (int c = 0; c < 8; ++c) {
       const int32_t voxel = at.voxel[c][l];
-      const Real* const missing = code.missing + (voxel == kInside ? R::kPitch : 0);
-      if constexpr (code.kNarrow) {
-        if (voxel >= 0)
-          add(field.voxels + int64_t(voxel) * R::kPitch, at.weight[c][l]);
-        else
-          add(missing, at.weight[c][l]);
-      } else {
-        add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch : missing, at.weight[c][l]);
-      }
+      add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch : code.missing + (voxel == kInside ? R::kPitch : 0),
+          at.weight[c][l]);
     }
   }
   for (int p = 0; p < R::kParts; ++p) sum.part[p] = code.decode(sum.part[p], p);

@@ -90,7 +90,8 @@ template <int N> SURFCAP_HD Pack<float, N> from_halves(const Half* from) {
   return load<float, N>(row);
 }
 
-// The upper bits of a row of halves, rounded by the lower bits of `noise`; |x| <= kMostE5m2, 0 <= x <= kMostU53.
+// Rows of the narrow formats: the upper bits of a row of halves, rounded by the lower bits of `noise`; |x| <=
+// kMostE5m2, 0 <= x <= kMostU53.
 template <int Cut, int N> SURFCAP_HD void cut_halves(const Pack<float, N>& x, const uint32_t* noise, uint8_t* to) {
   Half row[N];
   to_halves<N>(x, row);

@@ -13,6 +13,7 @@ from torch import Tensor
 from tests.ops.calls import GROUPS, MODES, arguments, normal, ops, raw, run
 from tests.ops.fields import Scene, assert_close, doubled, make_scene, one_tile
 from torch_surfcap import codes, reference
+from torch_surfcap.reference import DISTANCE
 from torch_surfcap.reference.codes import e5m2, u53
 
 BITS = (8, 16)
@@ -35,9 +36,9 @@ def call(name: str, scene: Scene) -> list[Any]:
     return [scene.voxels, *given[1:]]
 
 
-def narrow_scene(bits: int, degree: int = 1, opacity: int = 1, **settings: Any) -> Scene:
-    scene = make_scene(degree, opacity, torch.float32, **settings)
-    return replace(scene, voxels=codes.encode(scene.voxels, *scene.frame[4:], bits))
+def narrow_scene(bits: int, degree: int = 1, opacity: int = DISTANCE, rays: int = 24) -> Scene:
+    scene = make_scene(degree, opacity, torch.float32, rays=rays)
+    return replace(scene, voxels=codes.encode(scene.voxels, scene.frame[4], scene.frame[5], bits))
 
 
 def test_codes_by_hand() -> None:
@@ -143,13 +144,13 @@ def adam_arguments(bits: int, degree: int = 1, seed: int = 0) -> list[Any]:
 @pytest.mark.parametrize("bits", BITS)
 def test_adam_equals_reference(bits: int, degree: int, stochastic: bool) -> None:
     """Code for code, but where a sum in float32 falls on the other side of the noise than in double."""
+    oracle: Any = reference.adam_step
     mine = adam_arguments(bits, degree)
     theirs = [*(a.clone() for a in mine[:4]), *(a.double() for a in mine[4:])]
     for t in range(1, 5):
         gradient = adam_arguments(bits, degree, seed=t)[1]
         ops.adam_step(mine[0], gradient, *mine[2:], t=t, seed=5, stochastic=stochastic)
-        settings: dict[str, Any] = {"seed": 5, "stochastic": stochastic}
-        reference.adam_step(theirs[0], gradient.double(), *theirs[2:], t, **settings)
+        oracle(theirs[0], gradient.double(), *theirs[2:], t=t, seed=5, stochastic=stochastic)
         for actual, expected in zip((mine[0], *mine[2:4]), (theirs[0], *theirs[2:4]), strict=True):
             if actual.is_floating_point():
                 assert_close(actual, expected.double(), 1e-3)
@@ -167,8 +168,8 @@ def test_adam_is_within_a_step_of_the_float_one(bits: int, stochastic: bool) -> 
     frame = (4.0, -4.0)
     values = codes.decode(given[0], *frame)
     ops.adam_step(*given, t=1, stochastic=stochastic)
-    zeros = [torch.zeros_like(values) for _ in range(2)]
-    ops.adam_step(values, given[1], *zeros, *given[4:], t=1)
+    first, second = torch.zeros_like(values), torch.zeros_like(values)
+    ops.adam_step(values, given[1], first, second, *given[4:], t=1)
     step = (given[6] - given[5]) / (2**bits - 2)
     away = (codes.decode(given[0], *frame) - values).abs()
     assert (away <= (1.0 if stochastic else 0.5) * step + 1e-5).all()
@@ -265,10 +266,11 @@ def test_non_contiguous_empty_and_threads(name: str, bits: int, threads: None) -
 def test_opcheck(name: str, bits: int) -> None:
     scene = narrow_scene(bits, rays=12)
     given = [*adam_arguments(bits), 3] if name == "adam_step" else call(name, scene)
-    op, given = raw(name, given)
+    op, raw_arguments = raw(name, given)
     if name == "photometric_step":
-        given = (*given[:-1], torch.empty(GROUPS, *scene.voxels.shape, dtype=torch.float16))
-    torch.library.opcheck(op, given)
+        gradients = torch.empty(GROUPS, *scene.voxels.shape, dtype=torch.float16)
+        raw_arguments = (*raw_arguments[:-1], gradients)
+    torch.library.opcheck(op, raw_arguments)
 
 
 def test_wrong_arguments_are_named() -> None:
@@ -285,5 +287,6 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(RuntimeError, match="voxels: expected float32"):
         ops.sample_forward(*narrow_scene(8).field, scene.origins)
     voxels, table, frame = one_tile()
+    double = make_scene()
     with pytest.raises(RuntimeError, match="origins: expected float32"):
-        ops.visibility(voxels.byte(), table, frame, *scene.select(slice(1)).rays[:3], *scene.march())
+        ops.visibility(voxels.byte(), table, frame, *double.rays[:3], *double.march())
