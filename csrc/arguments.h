@@ -59,6 +59,18 @@ template <> struct TypeOf<int64_t> {
   static constexpr auto value = ScalarType::Long;
   static constexpr const char* name = "int64";
 };
+template <> struct TypeOf<uint8_t> {
+  static constexpr auto value = ScalarType::Byte;
+  static constexpr const char* name = "uint8";
+};
+template <> struct TypeOf<uint16_t> {
+  static constexpr auto value = ScalarType::UInt16;
+  static constexpr const char* name = "uint16";
+};
+template <> struct TypeOf<Half> {
+  static constexpr auto value = ScalarType::Half;
+  static constexpr const char* name = "float16";
+};
 
 // A contiguous tensor of the right type, kept alive as long as the pointer is used.
 template <class Number> class Input {
@@ -69,7 +81,7 @@ template <class Number> class Input {
     STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name,
                     ", as the other arguments are, got another type");
   }
-  const Number* data() const { return tensor_.template const_data_ptr<Number>(); }
+  const Number* data() const { return static_cast<const Number*>(tensor_.const_data_ptr()); }
   const Tensor& tensor() const { return tensor_; }
 
  private:
@@ -81,12 +93,13 @@ template <class Number> Number* output(const char* name, const Tensor& t, Shape 
   check_shape(name, t, shape);
   STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name);
   STD_TORCH_CHECK(t.is_contiguous(), name, ": is written in place and must be contiguous");
-  return t.template mutable_data_ptr<Number>();
+  return static_cast<Number*>(t.mutable_data_ptr());
 }
 
 // frame = [origin x, y, z, voxel size, opacity value outside, inside]
-template <class Real>
-Field<Real> field_view(const Input<Real>& voxels, const Input<int32_t>& table, const std::vector<double>& frame) {
+template <class Real, class Stored>
+Field<Real, Stored> field_view(const Input<Stored>& voxels, const Input<int32_t>& table,
+                               const std::vector<double>& frame) {
   STD_TORCH_CHECK(frame.size() == 6, "frame: expected [origin x, y, z, voxel size, outside, inside], got ",
                   frame.size(), " numbers");
   STD_TORCH_CHECK(frame[3] > 0, "frame: expected a positive voxel size, got ", frame[3]);
@@ -95,7 +108,7 @@ Field<Real> field_view(const Input<Real>& voxels, const Input<int32_t>& table, c
                   "voxels: expected 4, 16 or 32 numbers per voxel (SH degree 0, 1, 2, padded), got ", pitch);
   STD_TORCH_CHECK(voxels.tensor().size(0) < (int64_t(1) << 31) / kVoxelsPerTile,
                   "voxels: expected fewer than 33554432 tiles, got ", voxels.tensor().size(0));
-  Field<Real> field;
+  Field<Real, Stored> field;
   field.voxels = voxels.data();
   field.table = table.data();
   for (int i = 0; i < 3; ++i) {
@@ -112,15 +125,15 @@ Field<Real> field_view(const Input<Real>& voxels, const Input<int32_t>& table, c
   return field;
 }
 
-template <class Real> struct FieldArgument {
-  Input<Real> voxels;
+template <class Real, class Stored = Real> struct FieldArgument {
+  Input<Stored> voxels;
   Input<int32_t> table;
-  Field<Real> view;
+  Field<Real, Stored> view;
 
   FieldArgument(const Tensor& v, const Tensor& t, const std::vector<double>& frame)
       : voxels("voxels", v, {kAny, kTileSide, kTileSide, kTileSide, kAny}),
         table("table", t, {kAny, kAny, kAny}),
-        view(field_view(voxels, table, frame)) {
+        view(field_view<Real>(voxels, table, frame)) {
     // An index beyond the tiles would read foreign memory; one pass over the table costs little beside any op.
     const auto [least, most] = std::minmax_element(table.data(), table.data() + t.numel());
     STD_TORCH_CHECK(*most < view.tiles && *least > -(1 << 20), "table: expected entries from ", -(1 << 20),
@@ -166,8 +179,8 @@ template <class Real> RaySettings<Real> ray_settings(int64_t opacity, double slo
 }
 
 // Everything that the photometric loss of many rays is computed from.
-template <class Real> struct PhotometricArgument {
-  FieldArgument<Real> field;
+template <class Real, class Stored> struct PhotometricArgument {
+  FieldArgument<Real, Stored> field;
   RaysArgument<Real> rays;
   RangesArgument<Real> stretches;
   RaySettings<Real> settings;
@@ -230,5 +243,26 @@ template <class Real> struct SlotRowsArgument {
 // Runs f<float> or f<double> by the type of `t`.
 #define SURFCAP_BY_TYPE(t, f, ...) \
   ((t).scalar_type() == ScalarType::Double ? f<double>(__VA_ARGS__) : f<float>(__VA_ARGS__))
+
+// Runs f(types) by how a field is stored and gradients are summed: numbers of 32 or 64 bits in their own type, codes of
+// 8 and 16 bits computed with in float.
+template <class R, class St, class Su> struct FitTypes {
+  using Real = R;
+  using Stored = St;
+  using Sum = Su;
+};
+template <class F> auto by_storage(const Tensor& voxels, ScalarType sums, const F& f) {
+  const bool half = sums == ScalarType::Half;
+  switch (voxels.scalar_type()) {
+    case ScalarType::Double:
+      return f(FitTypes<double, double, double>{});
+    case ScalarType::Byte:
+      return half ? f(FitTypes<float, uint8_t, Half>{}) : f(FitTypes<float, uint8_t, float>{});
+    case ScalarType::UInt16:
+      return half ? f(FitTypes<float, uint16_t, Half>{}) : f(FitTypes<float, uint16_t, float>{});
+    default:
+      return f(FitTypes<float, float, float>{});
+  }
+}
 
 }  // namespace surfcap

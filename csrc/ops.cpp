@@ -28,7 +28,7 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
         ", Tensor coordinates, float[] weights, float huber, float bend, Tensor(a!) gradient) -> Tensor");
   m.def(
       "adam_step(Tensor(a!) voxels, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor low, "
-      "Tensor high, float beta1, float beta2, float epsilon, int t) -> ()");
+      "Tensor high, float beta1, float beta2, float epsilon, int t, int seed, bool stochastic) -> ()");
   m.def("soft_hull(Tensor points, Tensor projections, Tensor masks, Tensor sizes) -> (Tensor, Tensor)");
   m.def("upscale(" FIELD ", Tensor fine_coordinates, float[] fine_frame) -> Tensor");
 }

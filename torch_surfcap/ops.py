@@ -11,6 +11,9 @@ The field arguments, the same for every op:
   cells is empty as well. (Cell t is empty if the 8 tiles t .. t + 1 are outside.) The outermost tiles are outside.
 * ``frame``: [x, y, z of the table's low corner, voxel size, opacity value outside, opacity value inside].
 
+A fit's iteration (``photometric_step``, ``integration_ranges``, ``visibility``, ``voxel_terms``, ``adam_step``) also takes
+``voxels`` in uint8 or uint16, see :mod:`torch_surfcap.codes`, with everything else in float32 but for what is said below.
+
 The ray arguments: ``origins, directions [R, 3]`` (unit), ``shift [R]`` of the lattice t_k = (k + 1/2 + shift) * step in
 steps, ``background [R, 3]``, ``opacity`` 0 (the value is a transparency) or 1 (a signed distance in voxels with logistic
 ``slope``), ``step`` in world units, ``stop``: a ray ends once its transmittance is lower (0: never).
@@ -33,6 +36,7 @@ OUTSIDE = -2
 TILE = 4
 OPACITY = {"transparency": 0, "distance": 1}
 GROUPS = 4
+HALF_SCALE = 1024  # what gradients and moments in 16 and 8 bits are multiplied with, core/code.h
 
 _ops = torch.ops.torch_surfcap
 
@@ -158,7 +162,8 @@ def photometric_step(
         rendered_sample: samples are held against the ray's own rendered colour, taken for a constant, not the target.
         ranges: of the rays, as :func:`integration_ranges` gives them; they save the search for non-empty cells.
         gradients: [groups, T, 4, 4, 4, P], memory for the partial gradients; the first one receives the sum, which is what
-            is returned. Allocated where not given.
+            is returned. Allocated where not given. For codes they may be float16: the gradient times ``HALF_SCALE``, each
+            addition rounded to the nearest.
 
     Returns:
         losses [3] float64, not yet times ``weights``; the gradient of ``weights . losses`` [T, 4, 4, 4, P]; the colours
@@ -172,7 +177,7 @@ def photometric_step(
     march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample, rendered_sample)
     stretches = ranges or (None, None)
     if gradients is None:
-        gradients = voxels.new_empty(groups, *voxels.shape)
+        gradients = origins.new_empty(groups, *voxels.shape)
     losses, color, transmittance = _ops.photometric_step(
         *field, *rays, *seen, *stretches, *march, *loss, gradients
     )
@@ -329,7 +334,7 @@ def voxel_terms(
             for colour), of the parsimony (eq. 11, Huber over ``huber``, l > 0), of the ballooning (eq. 12) and of the
             curvature (Huber over ``bend`` of the 7-point Laplacian of the opacity value at the voxels that lie, with their
             6 neighbours, strictly between the boundary values; 0 and not computed where its weight is 0).
-        gradient: [T, 4, 4, 4, P], written in place.
+        gradient: [T, 4, 4, 4, P], written in place; beside codes also in float16, times ``HALF_SCALE``.
 
     Returns:
         losses [5] float64 in the order of ``weights``, not yet times them.
@@ -349,12 +354,18 @@ def adam_step(
     beta1: float = 0.9,
     beta2: float = 0.99,
     epsilon: float = 1e-8,
+    seed: int = 0,
+    stochastic: bool = True,
 ) -> None:
     """Step t = 1, 2, ... of Adam in place on ``voxels``, moments ``first`` and ``second``, then clamp to [low, high].
 
-    ``rate, low, high [P]`` are given per coefficient of a record.
+    ``rate, low, high [P]`` are given per coefficient of a record. Codes span [low, high]; beside them ``first`` is the
+    first moment and ``second`` the root of the second one, both times ``HALF_SCALE``: float16 beside uint16, and beside
+    uint8 the bits of e5m2 and of an unsigned 5-3 float, rounded stochastically. ``stochastic``: the codes are too, by a
+    hash of ``seed``, t and place, and otherwise to the nearest. ``gradient``: float32, or float16 times ``HALF_SCALE``.
     """
-    _ops.adam_step(voxels, gradient, first, second, rate, low, high, beta1, beta2, epsilon, t)
+    moments, bounds = (first, second), (rate, low, high)
+    _ops.adam_step(voxels, gradient, *moments, *bounds, beta1, beta2, epsilon, t, seed, stochastic)
 
 
 def soft_hull(points: Tensor, projections: Tensor, masks: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
@@ -399,8 +410,8 @@ def _register_shapes() -> None:
     @fake("torch_surfcap::photometric_step")
     def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
         rays = origins.shape[0]
-        losses = voxels.new_empty(3, dtype=torch.float64)
-        return losses, voxels.new_empty(rays, 3), voxels.new_empty(rays)
+        losses = origins.new_empty(3, dtype=torch.float64)
+        return losses, origins.new_empty(rays, 3), origins.new_empty(rays)
 
     @fake("torch_surfcap::photometric_lattice")
     def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
@@ -418,8 +429,8 @@ def _register_shapes() -> None:
         return origins.new_empty(origins.shape[0] + 1, dtype=torch.int64), origins.new_empty(count, 2)
 
     @fake("torch_surfcap::visibility")
-    def _(voxels, *rest):  # type: ignore[no-untyped-def]
-        return voxels.new_empty(*voxels.shape[:4], 2)
+    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
+        return origins.new_empty(*voxels.shape[:4], 2)
 
     @fake("torch_surfcap::voxel_terms")
     def _(voxels, *rest):  # type: ignore[no-untyped-def]

@@ -12,13 +12,17 @@ inline namespace SURFCAP_ISA {
 
 // Adds the gradient of `weight` times the term to the opacity values of a tile, and returns the term's share of the
 // tile's own voxels. `cell` is the tile's place in the table.
-template <class Real>
-SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t tile, Real weight, Real eps,
-                               Real* gradient) {
+template <class Real, class Stored, class Sum>
+SURFCAP_HD Real curvature_tile(const Field<Real, Stored>& field, int64_t cell, int64_t tile, Real weight, Real eps,
+                               Sum* gradient) {
   constexpr int kSide = 2 * kTile, kHalo = 2;  // the tile with two voxels around it: a neighbour's neighbours
   using Row = Pack<Real, kSide>;
   const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
-  const Real low = smaller(field.missing[0], field.missing[1]), high = larger(field.missing[0], field.missing[1]);
+  // Of codes, less than half a step inside: what a bound decodes to may be off by rounding.
+  const Real low_bound = smaller(field.missing[0], field.missing[1]),
+             high_bound = larger(field.missing[0], field.missing[1]);
+  const Real hair = kSteps<Stored> > 0 ? Real(0.25) / kSteps<Stored> * (high_bound - low_bound) : Real(0);
+  const Real low = low_bound + hair, high = high_bound - hair;
 
   // bend: the norm's derivative by the Laplacian. Only rows with x and y in 1..6 are read with those around them, so
   // the shifted rows along z never leave the arrays.
@@ -30,8 +34,7 @@ SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t t
       for (int z = 0; z < kSide; ++z) {
         const int32_t entry = field.table[column + (z + kHalo) / kTile - 1];
         const int64_t voxel = int64_t(entry) * kTileVoxels + local + (z + kHalo) % kTile;
-        value[(x * kSide + y) * kSide + z] =
-            entry < 0 ? field.missing[entry == kInside] : field.voxels[voxel * field.pitch];
+        value[(x * kSide + y) * kSide + z] = entry < 0 ? field.missing[entry == kInside] : opacity_value(field, voxel);
       }
     }
   }
@@ -69,8 +72,9 @@ SURFCAP_HD Real curvature_tile(const Field<Real>& field, int64_t cell, int64_t t
   for (int v = 0; v < kTileVoxels / kTile; ++v) {  // rows of the tile
     const int row = ((v / kTile + kHalo) * kSide + v % kTile + kHalo) * kSide;
     const Row here = load<Real, kSide>(bend + row);
-    const Row by_value = weight * (sum_of_neighbours(bend + row) - Real(2 * 3) * here);
-    for (int z = 0; z < kTile; ++z) gradient[(tile * kTileVoxels + v * kTile + z) * field.pitch] += by_value[z + kHalo];
+    const Row by_value = Real(kSumScale<Sum>) * weight * (sum_of_neighbours(bend + row) - Real(2 * 3) * here);
+    for (int z = 0; z < kTile; ++z)
+      add_to(gradient + (tile * kTileVoxels + v * kTile + z) * field.pitch, by_value[z + kHalo]);
   }
   return loss;
 }

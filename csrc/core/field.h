@@ -4,7 +4,7 @@
 // table's outermost tiles are outside, so a read never needs a bounds check once its base voxel is clamped.
 #pragma once
 
-#include "harmonics.h"
+#include "code.h"
 
 namespace surfcap {
 inline namespace SURFCAP_ISA {
@@ -26,17 +26,17 @@ template <class Real> struct Footprints {
 
 // Positions u[axis] of kLanes points -> footprints.
 template <class Real>
-SURFCAP_HD void locate(const Field<Real>& field, const Pack<Real, kLanes> (&u)[3], Footprints<Real>& out) {
+SURFCAP_HD void locate(const Grid<Real>& grid, const Pack<Real, kLanes> (&u)[3], Footprints<Real>& out) {
   using Index = Pack<int32_t, kLanes>;
   using Number = Pack<Real, kLanes>;
-  const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
+  const int32_t stride[3] = {grid.n[1] * grid.n[2], grid.n[2], 1};
   const int32_t inner[3] = {kTile * kTile, kTile, 1};
   const Index none = fill_pack<int32_t, kLanes>(0);
   const Number zero = zero_pack<Real, kLanes>(), one = fill_pack<Real, kLanes>(Real(1));
   Index tile[3][2], local[3][2];  // of the lower and the upper corner along each axis
   Number weight[3][2];
   for (int axis = 0; axis < 3; ++axis) {
-    const Index last = fill_pack<int32_t, kLanes>(kTile * (field.n[axis] - 1) - 1);
+    const Index last = fill_pack<int32_t, kLanes>(kTile * (grid.n[axis] - 1) - 1);
     Index base = convert_pack<int32_t, kLanes, Real>(u[axis]);
     base = smaller_pack<int32_t, kLanes>(larger_pack<int32_t, kLanes>(base, none), last);
     const Number f = u[axis] - convert_pack<Real, kLanes, int32_t>(base);
@@ -50,7 +50,7 @@ SURFCAP_HD void locate(const Field<Real>& field, const Pack<Real, kLanes> (&u)[3
   Index least = fill_pack<int32_t, kLanes>(0);
   for (int c = 0; c < 8; ++c) {
     const int cx = c >> 2, cy = (c >> 1) & 1, cz = c & 1;
-    const Index t = look_up<kLanes>(field.table, tile[0][cx] + tile[1][cy] + tile[2][cz]);
+    const Index t = look_up<kLanes>(grid.table, tile[0][cx] + tile[1][cy] + tile[2][cz]);
     // A stored tile has voxel >= t, a missing one (t < 0) voxel <= t: the greater is the index, or t's own meaning.
     const Index voxel = t * kTileVoxels + (local[0][cx] + local[1][cy] + local[2][cz]);
     store<int32_t, kLanes>(out.voxel[c], larger_pack<int32_t, kLanes>(t, voxel));
@@ -62,10 +62,11 @@ SURFCAP_HD void locate(const Field<Real>& field, const Pack<Real, kLanes> (&u)[3
 
 // Asks for the records that the first `count` lanes will read from, or add to, `records`. On CUDA the many threads of a
 // multiprocessor hide the wait instead.
-template <class Real, int Degree> SURFCAP_HD void prefetch(const Real* records, const Footprints<Real>& at, int count) {
+template <int Degree, class Number, class Real>
+SURFCAP_HD void prefetch(const Number* records, const Footprints<Real>& at, int count) {
 #if !defined(__CUDACC__)
   using R = Record<Degree>;
-  constexpr int kLine = 64 / sizeof(Real);
+  constexpr int kLine = 64 / sizeof(Number);
   // Small records of one column along z share a cache line most of the time.
   constexpr int kStride = R::kPitch * 2 <= kLine ? 2 : 1;
   for (int l = 0; l < count; ++l)
@@ -76,45 +77,37 @@ template <class Real, int Degree> SURFCAP_HD void prefetch(const Real* records, 
 
 // The trilinear read of lane l: sum of weight times record over the 8 corners. A missing corner is black and has the
 // boundary's opacity value: it reads a constant record instead.
-template <class Real, int Degree>
-SURFCAP_HD Coefficients<Real, Degree> interpolate(const Field<Real>& field, const Real* missing_records,
-                                                  const Footprints<Real>& at, int l) {
+template <class Real, int Degree, class Stored>
+SURFCAP_HD Coefficients<Real, Degree> interpolate(const Field<Real, Stored>& field,
+                                                  const Code<Real, Degree, Stored>& code, const Footprints<Real>& at,
+                                                  int l) {
   using R = Record<Degree>;
   Coefficients<Real, Degree> sum;
   for (int p = 0; p < R::kParts; ++p) sum.part[p] = zero_pack<Real, R::kPart>();
-  const auto add = [&](const Real* record, Real weight) {
-    for (int p = 0; p < R::kParts; ++p) sum.part[p] += weight * load<Real, R::kPart>(record + p * R::kPart);
+  const auto add = [&](const Stored* record, Real weight) {
+    for (int p = 0; p < R::kParts; ++p) sum.part[p] += weight * load_as<Real, R::kPart>(record + p * R::kPart);
   };
   if (at.least[l] >= 0) {
     for (int c = 0; c < 8; ++c) add(field.voxels + int64_t(at.voxel[c][l]) * R::kPitch, at.weight[c][l]);
   } else {
     for (int c = 0; c < 8; ++c) {
       const int32_t voxel = at.voxel[c][l];
-      add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch : missing_records + (voxel == kInside ? R::kPitch : 0),
+      add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch : code.missing + (voxel == kInside ? R::kPitch : 0),
           at.weight[c][l]);
     }
   }
+  for (int p = 0; p < R::kParts; ++p) sum.part[p] = code.decode(sum.part[p], p);
   return sum;
-}
-
-// The records that missing tiles read: outside, then inside.
-template <class Real, int Degree> SURFCAP_HD void fill_missing(const Field<Real>& field, Real* records) {
-  for (int i = 0; i < 2 * Record<Degree>::kPitch; ++i) records[i] = Real(0);
-  records[0] = field.missing[0];
-  records[Record<Degree>::kPitch] = field.missing[1];
 }
 
 // The adjoint of interpolate: adds weight times gradient to the 8 corners' records; missing corners have no gradient
 // and are sent to a spare record.
-template <class Real, int Degree>
-SURFCAP_HD void scatter(Real* gradient, Real* spare, const Footprints<Real>& at, int l,
-                        const Coefficients<Real, Degree>& g) {
+template <class Real, int Degree, class Sum>
+SURFCAP_HD void scatter(Sum* gradient, Sum* spare, const Footprints<Real>& at, int l, Coefficients<Real, Degree> g) {
   using R = Record<Degree>;
-  const auto add = [&](Real* record, Real weight) {
-    for (int p = 0; p < R::kParts; ++p) {
-      Real* const to = record + p * R::kPart;
-      store<Real, R::kPart>(to, load<Real, R::kPart>(to) + weight * g.part[p]);
-    }
+  for (int p = 0; p < R::kParts; ++p) g.part[p] = Real(kSumScale<Sum>) * g.part[p];
+  const auto add = [&](Sum* record, Real weight) {
+    for (int p = 0; p < R::kParts; ++p) add_to<Real, R::kPart>(record + p * R::kPart, weight * g.part[p]);
   };
   if (at.least[l] >= 0) {
     for (int c = 0; c < 8; ++c) add(gradient + int64_t(at.voxel[c][l]) * R::kPitch, at.weight[c][l]);

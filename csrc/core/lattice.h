@@ -12,13 +12,13 @@ template <class Real> struct Line {
   Pack<Real, 4> origin, direction;
 
   Line() = default;
-  SURFCAP_HD Line(const Field<Real>& field, const Real* o, const Real* d) {
+  SURFCAP_HD Line(const Grid<Real>& grid, const Real* o, const Real* d) {
     constexpr Real kHair = Real(1e-20);
     origin = zero_pack<Real, 4>();
     direction = fill_pack<Real, 4>(Real(1));
     for (int i = 0; i < 3; ++i) {
-      origin[i] = (o[i] - field.origin[i]) * field.per_unit - Real(0.5);
-      const Real slope = d[i] * field.per_unit;
+      origin[i] = (o[i] - grid.origin[i]) * grid.per_unit - Real(0.5);
+      const Real slope = d[i] * grid.per_unit;
       direction[i] = slope < kHair && slope > -kHair ? kHair : slope;
     }
   }
@@ -28,14 +28,14 @@ template <class Real> struct Line {
 template <class Real> class Cells {
  public:
   Cells() = default;
-  SURFCAP_HD Cells(const Field<Real>& field, const Line<Real>& ray) : line(ray), table_(field.table) {
+  SURFCAP_HD Cells(const Grid<Real>& grid, const Line<Real>& ray) : line(ray), table_(grid.table) {
     inverse_ = fill_pack<Real, 4>(Real(1)) / line.direction;
-    for (int axis = 0; axis < 2; ++axis) stride_[axis] = field.n[axis + 1];
+    for (int axis = 0; axis < 2; ++axis) stride_[axis] = grid.n[axis + 1];
     Real high[4] = {};
     int32_t last_cell[4] = {}, forward[4] = {};
     for (int axis = 0; axis < 3; ++axis) {
-      high[axis] = Real(kTile * (field.n[axis] - 1));
-      last_cell[axis] = field.n[axis] - 2;
+      high[axis] = Real(kTile * (grid.n[axis] - 1));
+      last_cell[axis] = grid.n[axis] - 2;
       forward[axis] = line.direction[axis] > Real(0);
     }
     last_cell_ = load<int32_t, 4>(last_cell);

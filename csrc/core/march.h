@@ -37,10 +37,10 @@ template <class Real, class Opacity> struct Trace {
 };
 
 // The most samples a ray can have in this field, rounded up to whole groups of lanes, and one group to spare.
-template <class Real> SURFCAP_HD int64_t trace_capacity(const Field<Real>& field, Real step) {
+template <class Real> SURFCAP_HD int64_t trace_capacity(const Grid<Real>& grid, Real step) {
   Real squared = Real(0);
-  for (int i = 0; i < 3; ++i) squared += Real(kTile * field.n[i]) * Real(kTile * field.n[i]);
-  const int64_t longest = int64_t(std::ceil(std::sqrt(squared) / (step * field.per_unit))) + 2;
+  for (int i = 0; i < 3; ++i) squared += Real(kTile * grid.n[i]) * Real(kTile * grid.n[i]);
+  const int64_t longest = int64_t(std::ceil(std::sqrt(squared) / (step * grid.per_unit))) + 2;
   return (longest / kLanes + 2) * kLanes;
 }
 
@@ -55,7 +55,8 @@ template <class Real, int Degree, class Opacity> struct Walk {
   Pack<Real, kLanes> t;
   int count;  // samples set up and not yet gone through
 
-  SURFCAP_HD void start(const Field<Real>& field, const Lattice<Real>& samples, const Real* direction,
+  template <class Stored>
+  SURFCAP_HD void start(const Field<Real, Stored>& field, const Lattice<Real>& samples, const Real* direction,
                         const Trace<Real, Opacity>& room) {
     lattice = samples;
     weights = basis_weights<Real, Degree>(direction);
@@ -65,8 +66,9 @@ template <class Real, int Degree, class Opacity> struct Walk {
   }
 
   // `gradient`, where given, is what the walk back will add to: it is fetched meanwhile.
-  SURFCAP_HD void finish(const Field<Real>& field, const Real* missing_records, Real stop, const Opacity& opacity,
-                         const Real* gradient) {
+  template <class Stored, class Sum>
+  SURFCAP_HD void finish(const Field<Real, Stored>& field, const Code<Real, Degree, Stored>& code, Real stop,
+                         const Opacity& opacity, const Sum* gradient) {
     typename Opacity::State before = opacity.outside();
     Pack<Real, 4> color_before = zero_pack<Real, 4>();
     int k_before = -2;
@@ -74,7 +76,7 @@ template <class Real, int Degree, class Opacity> struct Walk {
       const Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
       int l = 0;
       for (bool alive = true; alive && l < count; ++l) {
-        Pack<Real, 4> color = fold<Real, Degree>(interpolate<Real, Degree>(field, missing_records, at, l), weights);
+        Pack<Real, 4> color = fold<Real, Degree>(interpolate(field, code, at, l), weights);
         Sample<Real, Opacity>& sample = trace.samples[ray.samples++];
         sample.starts_run = k[l] != k_before + 1;
         k_before = k[l];
@@ -98,14 +100,14 @@ template <class Real, int Degree, class Opacity> struct Walk {
         ray.transmittance *= sample.a;
         alive = !(ray.transmittance < stop);
       }
-      if (gradient) prefetch<Real, Degree>(gradient, at, l);
+      if (gradient) prefetch<Degree>(gradient, at, l);
       if (l < kLanes || ray.transmittance < stop) break;
       set_up(field);
     }
   }
 
  private:
-  SURFCAP_HD void set_up(const Field<Real>& field) {
+  template <class Stored> SURFCAP_HD void set_up(const Field<Real, Stored>& field) {
     // A ray of unit direction never fills its room; another one ends there.
     count = ray.samples + kLanes <= trace.capacity ? lattice.next(k, kLanes) : 0;
     if (count == 0) return;
@@ -114,22 +116,21 @@ template <class Real, int Degree, class Opacity> struct Walk {
     lattice.place(k, t, u);
     Footprints<Real>& at = trace.footprints[ray.samples / kLanes];
     locate(field, u, at);
-    prefetch<Real, Degree>(field.voxels, at, count);
+    prefetch<Degree>(field.voxels, at, count);
   }
 };
 
 // Adds the samples' gradients to the voxels that they read. Memory rule: adds.
-template <class Real, int Degree> struct ToVoxels {
-  Real* gradient;  // [tiles, 4, 4, 4, pitch]
-  Real* spare;
+template <class Real, int Degree, class Sum = Real> struct ToVoxels {
+  Sum* gradient;  // [tiles, 4, 4, 4, pitch]
+  Sum* spare;
 
   // What the walk back will add to: it is fetched meanwhile.
-  const Real* prefetched() const { return gradient; }
+  const Sum* prefetched() const { return gradient; }
 
   template <class Walk> SURFCAP_HD auto sink(const Walk& walk, int64_t) const {
     return [this, &walk](int i, const auto&, const Pack<Real, 4>& g) {
-      scatter<Real, Degree>(gradient, spare, walk.trace.footprints[i / kLanes], i % kLanes,
-                            unfold<Real, Degree>(g, walk.weights));
+      scatter(gradient, spare, walk.trace.footprints[i / kLanes], i % kLanes, unfold<Real, Degree>(g, walk.weights));
     };
   }
 };

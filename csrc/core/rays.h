@@ -23,18 +23,17 @@ template <class Real> SURFCAP_HD Real dot_color(const Pack<Real, 4>& a, const Pa
 template <class Real> constexpr Real kNothing = Real(sizeof(Real) == 4 ? 1e-6 : 1e-12);
 
 // Marches rays through a field. `room` is that of the first of kBundle rays; the others' follow it.
-template <class Real, int Degree, class Opacity> struct Marcher {
+template <class Real, int Degree, class Opacity, class Stored = Real> struct Marcher {
   using Walk = surfcap::Walk<Real, Degree, Opacity>;
-  const Field<Real>& field;
+  const Field<Real, Stored>& field;
   const RaySettings<Real>& settings;
   const Opacity& opacity;
   Trace<Real, Opacity> room;
-  Real missing_records[2 * Record<Degree>::kPitch];
+  Code<Real, Degree, Stored> code;
 
-  SURFCAP_HD Marcher(const Field<Real>& f, const RaySettings<Real>& s, const Opacity& o, const Trace<Real, Opacity>& r)
-      : field(f), settings(s), opacity(o), room(r) {
-    fill_missing<Real, Degree>(field, missing_records);
-  }
+  SURFCAP_HD Marcher(const Field<Real, Stored>& f, const RaySettings<Real>& s, const Opacity& o,
+                     const Trace<Real, Opacity>& r)
+      : field(f), settings(s), opacity(o), room(r), code(f) {}
 
   // Begins ray i in the `slot`-th room.
   SURFCAP_HD void start(Walk& walk, const Rays<Real>& rays, int64_t i, int slot = 0) const {
@@ -47,8 +46,8 @@ template <class Real, int Degree, class Opacity> struct Marcher {
                {room.samples + slot * room.capacity, room.footprints + slot * room.capacity / kLanes, room.capacity});
   }
 
-  SURFCAP_HD void finish(Walk& walk, const Real* gradient = nullptr) const {
-    walk.finish(field, missing_records, settings.stop, opacity, gradient);
+  template <class Sum = Real> SURFCAP_HD void finish(Walk& walk, const Sum* gradient = nullptr) const {
+    walk.finish(field, code, settings.stop, opacity, gradient);
   }
 
   // Both, for a ray on its own.
@@ -99,11 +98,11 @@ SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march,
 
 // One ray of the fused step, its walk forward done: adds (photo, sample, mask), each times the ray's weight, to
 // `losses`, sends the gradient of their weighted sum `to` the voxels or to slots, and writes colour and transmittance.
-template <class Real, int Degree, class Opacity, class To>
-SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, const Walk<Real, Degree, Opacity>& walk,
-                                const Rays<Real>& rays, const Observation<Real>& seen,
-                                const PhotometricSettings<Real>& loss, int64_t i, double* losses, Real* color,
-                                Real* transmittance, const To& to) {
+template <class Real, int Degree, class Opacity, class Stored, class To>
+SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity, Stored>& march,
+                                const Walk<Real, Degree, Opacity>& walk, const Rays<Real>& rays,
+                                const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t i,
+                                double* losses, Real* color, Real* transmittance, const To& to) {
   const RayResult<Real>& ray = walk.ray;
   const Pack<Real, 4> target = color_of(seen.target + 3 * i), background = color_of(rays.background + 3 * i);
   const Pack<Real, 4> rendered = ray.sum + ray.transmittance * background;
@@ -140,11 +139,11 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity>& march, con
 
 // The rays begin..end of the fused step, a bundle at a time: all its rays are started before the first is gone through,
 // and all are gone through before the first walk back, so that the waits for memory overlap.
-template <class Real, int Degree, class Opacity, class To>
-SURFCAP_HD void photometric_rays(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays,
+template <class Real, int Degree, class Opacity, class Stored, class To>
+SURFCAP_HD void photometric_rays(const Marcher<Real, Degree, Opacity, Stored>& march, const Rays<Real>& rays,
                                  const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin,
                                  int64_t end, double* losses, Real* color, Real* transmittance, const To& to) {
-  typename Marcher<Real, Degree, Opacity>::Walk walks[kBundle];
+  typename Marcher<Real, Degree, Opacity, Stored>::Walk walks[kBundle];
   for (int64_t first = begin; first < end; first += kBundle) {
     const int count = int(smaller<int64_t>(kBundle, end - first));
     for (int r = 0; r < count; ++r) march.start(walks[r], rays, first + r, r);
@@ -157,10 +156,10 @@ SURFCAP_HD void photometric_rays(const Marcher<Real, Degree, Opacity>& march, co
 // Integration ranges (paper, section 4.1) of ray i: the stretches [begin, end) of distance that are not as good as
 // empty, a step wider on either side than the samples whose value is under `quiet`, and two steps beyond where the ray
 // ends. Writes them to `out`, which has room for one per sample, and returns their number.
-template <class Real, int Degree, class Opacity>
-SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real quiet,
-                          Real* out) {
-  typename Marcher<Real, Degree, Opacity>::Walk walk;
+template <class Real, int Degree, class Opacity, class Stored>
+SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity, Stored>& march, const Rays<Real>& rays, int64_t i,
+                          Real quiet, Real* out) {
+  typename Marcher<Real, Degree, Opacity, Stored>::Walk walk;
   march.walk(walk, rays, i);
   const RayResult<Real>& ray = walk.ray;
   const Real step = march.settings.step;
@@ -180,10 +179,10 @@ SURFCAP_HD int ray_ranges(const Marcher<Real, Degree, Opacity>& march, const Ray
 }
 
 // Raises, at every voxel that a sample of ray i reads with a positive weight, seen[0] to T_k and seen[1] to w_k.
-template <class Real, int Degree, class Opacity>
-SURFCAP_HD void visibility_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
+template <class Real, int Degree, class Opacity, class Stored>
+SURFCAP_HD void visibility_ray(const Marcher<Real, Degree, Opacity, Stored>& march, const Rays<Real>& rays, int64_t i,
                                Real* seen) {
-  typename Marcher<Real, Degree, Opacity>::Walk walk;
+  typename Marcher<Real, Degree, Opacity, Stored>::Walk walk;
   march.walk(walk, rays, i);
   const RayResult<Real>& ray = walk.ray;
   for (int k = 0; k < ray.samples; ++k) {

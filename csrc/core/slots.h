@@ -21,11 +21,11 @@ inline namespace SURFCAP_ISA {
 
 template <class Real> SURFCAP_HD void store_slot(Real* slot, const Pack<Real, 4>& g) { store<Real, 4>(slot, g); }
 template <class Real> SURFCAP_HD void store_slot(uint8_t* slot, const Pack<Real, 4>& g) {
-  for (int i = 0; i < 4; ++i) slot[i] = encode_e5m2(float(g[i]));
+  for (int i = 0; i < 4; ++i) slot[i] = nearest_e5m2(float(g[i]));
 }
 template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const Real* slot) { return load<Real, 4>(slot); }
 template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const uint8_t* slot) {
-  return convert_pack<Real, 4, float>(decode_e5m2(slot));
+  return convert_pack<Real, 4, float>(decode_e5m2<4>(slot));
 }
 
 // Writes the samples' gradients into their rays' rows, which are cleared first: a ray may end before its row does.
@@ -60,7 +60,7 @@ template <class Real> struct Stand {
 };
 
 template <class Real>
-SURFCAP_HD void find_stand(const Field<Real>& field, const int32_t* coordinate, int first,
+SURFCAP_HD void find_stand(const Grid<Real>& field, const int32_t* coordinate, int first,
                            const SlotCameras<Real>& cameras, int64_t v, Stand<Real>& out) {
   using Number = Pack<Real, kLanes>;
   using Index = Pack<int32_t, kLanes>;
@@ -160,7 +160,7 @@ SURFCAP_HD void find_reach(const SlotCameras<Real>& cameras, const SlotRows<Real
 
 // The gradient of one tile's voxels, all cameras in their order. Memory rule: writes `gradient` [4, 4, 4, pitch].
 template <class Real, int Degree, class Slot>
-SURFCAP_HD void gather_tile(const Field<Real>& field, const int32_t* coordinate, const SlotCameras<Real>& cameras,
+SURFCAP_HD void gather_tile(const Grid<Real>& field, const int32_t* coordinate, const SlotCameras<Real>& cameras,
                             const SlotRows<Real>& rows, const Slot* slots, Real* gradient) {
   using R = Record<Degree>;
   Stand<Real> stands[kTileVoxels / kLanes];

@@ -6,9 +6,13 @@
 
 namespace surfcap {
 
-// The sparse field: a record of `pitch` numbers per voxel, 4x4x4 voxels to a tile, a table of tile indices.
-template <class Real> struct Field {
-  const Real* voxels;    // [tiles, 4, 4, 4, pitch]
+// A number of IEEE's 16-bit format.
+struct Half {
+  uint16_t bits;
+};
+
+// Where the voxels of a sparse field lie: 4x4x4 of them to a tile, a table of tile indices.
+template <class Real> struct Grid {
   const int32_t* table;  // [n0, n1, n2], its outermost tiles outside
   int32_t n[3];
   Real origin[3];   // low corner of the table, world
@@ -17,6 +21,20 @@ template <class Real> struct Field {
   int64_t tiles;
   int32_t pitch;  // 4, 16 or 32 for spherical harmonics of degree 0, 1 or 2
 };
+
+// The field: a record of `pitch` numbers per voxel, of the type that one computes with, or codes of 8 or 16 bits.
+template <class Real, class Stored = Real> struct Field : Grid<Real> {
+  const Stored* voxels;  // [tiles, 4, 4, 4, pitch]
+};
+
+// What Adam's moments are kept in beside values of a type.
+template <class Stored> struct Moment {
+  using type = Stored;
+};
+template <> struct Moment<uint16_t> {
+  using type = Half;
+};
+template <class Stored> using MomentOf = typename Moment<Stored>::type;
 
 template <class Real> struct Rays {
   const Real* origins;     // [R, 3] world
@@ -83,6 +101,8 @@ template <class Real> struct AdamSettings {
   Real beta1, beta2, epsilon;
   Real correction1, correction2;  // 1/(1 - beta^t)
   const Real *rate, *low, *high;  // [pitch] per coefficient
+  uint32_t key;                   // of the noise that rounds codes
+  bool stochastic;                // whether codes are rounded by noise, or to the nearest
 };
 
 template <class Real> struct Silhouettes {

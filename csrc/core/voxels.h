@@ -1,7 +1,5 @@
-// What is done with one tile: the voxel terms of the loss and the step of Adam.
+// The terms of the loss that one tile has by itself.
 #pragma once
-
-#include <cmath>
 
 #include "curvature.h"
 #include "rays.h"
@@ -15,9 +13,10 @@ inline namespace SURFCAP_ISA {
 //   curvature of the opacity value, see there; left out where its weight is 0
 // A missing neighbour counts with its boundary value for the opacity and not at all for colour: black would bleed in.
 // losses: tv opacity, tv colour, parsimony, ballooning, curvature, unweighted.
-template <class Real, int Degree>
-SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordinate, const VoxelTerms<Real>& terms,
-                                 int64_t tile, double* losses, Real* gradient) {
+template <int Degree, class Real, class Stored, class Sum>
+SURFCAP_HD void voxel_terms_tile(const Field<Real, Stored>& field, const Code<Real, Degree, Stored>& code,
+                                 const int32_t* coordinate, const VoxelTerms<Real>& terms, int64_t tile, double* losses,
+                                 Sum* gradient) {
   using R = Record<Degree>;
   using P = Pack<Real, R::kPart>;
   const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
@@ -34,13 +33,18 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
     tv_row[i] = i == 0 ? terms.tv_opacity : is_color[i] * terms.tv_color;
     parsimony_row[i] = i > 3 && i < R::kCoefficients ? Real(1) : Real(0);
   }
+  const auto read = [&](int64_t voxel, int p) {
+    return code.decode(load_as<Real, R::kPart>(field.voxels + voxel * R::kPitch + p * R::kPart), p);
+  };
   P squares[R::kParts];  // over the pairs met; a pair of two stored voxels is met from both
   for (int p = 0; p < R::kParts; ++p) squares[p] = zero_pack<Real, R::kPart>();
   Real parsimony = Real(0), ballooning = Real(0), boundary = Real(0);
 
   for (int v = 0; v < kTileVoxels; ++v) {
     const int64_t voxel = tile * kTileVoxels + v;
-    const Real* record = field.voxels + voxel * R::kPitch;
+    P record[R::kParts];
+    for (int p = 0; p < R::kParts; ++p) record[p] = read(voxel, p);
+    const Real value = record[0][0];
     const int place[3] = {v / inner[0], (v / inner[1]) & 3, v & 3};
     P sum[R::kParts];
     for (int p = 0; p < R::kParts; ++p) sum[p] = zero_pack<Real, R::kPart>();
@@ -50,7 +54,7 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
         const bool within = side ? place[axis] < kTile - 1 : place[axis] > 0;
         const int32_t other = within ? int32_t(tile) : neighbour[axis][side];
         if (other < 0) {
-          const Real d = record[0] - field.missing[other == kInside];
+          const Real d = value - field.missing[other == kInside];
           to_boundary += d;
           boundary += d * d;
           continue;
@@ -58,28 +62,27 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
         const int step = (side ? 1 : -1) * inner[axis];
         const int64_t at = int64_t(other) * kTileVoxels + (within ? v + step : v - (kTile - 1) * step);
         for (int p = 0; p < R::kParts; ++p) {
-          const P d = load<Real, R::kPart>(record + p * R::kPart) -
-                      load<Real, R::kPart>(field.voxels + at * R::kPitch + p * R::kPart);
+          const P d = record[p] - read(at, p);
           sum[p] += d;
           squares[p] += d * d;
         }
       }
     }
-    Real* const to = gradient + voxel * R::kPitch;
+    Sum* const to = gradient + voxel * R::kPitch;
     for (int p = 0; p < R::kParts; ++p) {
       P g = (Real(2) * load<Real, R::kPart>(tv_row + p * R::kPart)) * sum[p];
       if constexpr (Degree > 0) {
         for (int i = 0; i < R::kPart; ++i) {
           Real derivative;
-          const Real norm = huber(record[p * R::kPart + i], terms.huber, derivative);
+          const Real norm = huber(record[p][i], terms.huber, derivative);
           parsimony += parsimony_row[p * R::kPart + i] * norm;
           g[i] += terms.parsimony * parsimony_row[p * R::kPart + i] * derivative;
         }
       }
-      if (p == 0) g[0] += Real(2) * (terms.tv_opacity * to_boundary + terms.ballooning * record[0]);
-      store<Real, R::kPart>(to + p * R::kPart, load<Real, R::kPart>(to + p * R::kPart) + g);
+      if (p == 0) g[0] += Real(2) * (terms.tv_opacity * to_boundary + terms.ballooning * value);
+      add_to<Real, R::kPart>(to + p * R::kPart, Real(kSumScale<Sum>) * g);
     }
-    ballooning += record[0] * record[0];
+    ballooning += value * value;
   }
   Real tv_color = Real(0);
   for (int p = 0; p < R::kParts; ++p)
@@ -90,22 +93,6 @@ SURFCAP_HD void voxel_terms_tile(const Field<Real>& field, const int32_t* coordi
   losses[3] += double(ballooning);
   if (terms.curvature != Real(0))
     losses[4] += double(curvature_tile(field, cell, tile, terms.curvature, terms.bend, gradient));
-}
-
-// Adam (Kingma and Ba 2015) on `count` numbers that begin at a record, then the clamp to [low, high].
-template <class Real, int Pitch>
-SURFCAP_HD void adam_records(Real* value, const Real* gradient, Real* first, Real* second, int64_t records,
-                             const AdamSettings<Real>& adam) {
-  for (int64_t r = 0; r < records; ++r) {
-    for (int i = 0; i < Pitch; ++i) {
-      const int64_t at = r * Pitch + i;
-      const Real g = gradient[at];
-      first[at] = adam.beta1 * first[at] + (Real(1) - adam.beta1) * g;
-      second[at] = adam.beta2 * second[at] + (Real(1) - adam.beta2) * g * g;
-      const Real step = first[at] * adam.correction1 / (std::sqrt(second[at] * adam.correction2) + adam.epsilon);
-      value[at] = clamped(value[at] - adam.rate[i] * step, adam.low[i], adam.high[i]);
-    }
-  }
 }
 
 }  // namespace SURFCAP_ISA

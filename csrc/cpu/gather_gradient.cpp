@@ -46,13 +46,14 @@ template <class Real> struct SlotCamerasArgument {
   }
 };
 
-template <class Real>
+template <class Types>
 void gather_gradient_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
                            const Tensor& coordinates, const Tensor& matrices, const Tensor& centers,
                            const Tensor& windows, const Tensor& window_rays, const Tensor& shift, double step,
                            const Tensor& starts, const Tensor& first, int64_t exponent, const Tensor& slots,
                            const Tensor& gradient) {
-  const FieldArgument<Real> field(voxels, table, frame);
+  using Real = typename Types::Real;
+  const FieldArgument<Real, typename Types::Stored> field(voxels, table, frame);
   const int64_t tiles = field.view.tiles;
   const Input<int32_t> places = tile_places(coordinates, tiles, field.view.n);
   const SlotRowsArgument<Real> rows(starts, first, exponent, slots, kAny);
@@ -68,8 +69,10 @@ void gather_gradient_typed(const Tensor& voxels, const Tensor& table, const std:
 void gather_gradient(Tensor voxels, Tensor table, std::vector<double> frame, Tensor coordinates, Tensor matrices,
                      Tensor centers, Tensor windows, Tensor window_rays, Tensor shift, double step, Tensor starts,
                      Tensor first, int64_t exponent, Tensor slots, Tensor gradient) {
-  SURFCAP_BY_TYPE(voxels, gather_gradient_typed, voxels, table, frame, coordinates, matrices, centers, windows,
-                  window_rays, shift, step, starts, first, exponent, slots, gradient);
+  by_storage(voxels, gradient.scalar_type(), [&](auto types) {
+    gather_gradient_typed<decltype(types)>(voxels, table, frame, coordinates, matrices, centers, windows, window_rays,
+                                           shift, step, starts, first, exponent, slots, gradient);
+  });
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("gather_gradient", TORCH_BOX(&gather_gradient)); }

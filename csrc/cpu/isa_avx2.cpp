@@ -15,7 +15,7 @@
 #else
 #pragma GCC target("avx2,fma,bmi,bmi2,f16c")
 #endif
-#define SURFCAP_F16C  // compilers define their own macros late, if at all, after a pragma
+#define SURFCAP_AVX2  // __AVX2__ and its like do not follow the pragma in every compiler
 #define SURFCAP_ISA avx2
 #define SURFCAP_ISA_NAME "avx2"
 #include "kernels_isa.h"

@@ -16,7 +16,8 @@
 #else
 #pragma GCC target("avx512f,avx512bw,avx512dq,avx512vl,avx2,fma,bmi,bmi2,f16c")
 #endif
-#define SURFCAP_F16C  // compilers define their own macros late, if at all, after a pragma
+#define SURFCAP_AVX2  // __AVX2__ and its like do not follow the pragma in every compiler
+#define SURFCAP_AVX512
 #define SURFCAP_ISA avx512
 #define SURFCAP_ISA_NAME "avx512"
 #include "kernels_isa.h"

@@ -1,4 +1,5 @@
 // The body of the kernel tables, compiled once per instruction set by isa_*.cpp, which set SURFCAP_ISA and the target.
+#include "../core/adam.h"
 #include "../core/rays.h"
 #include "../core/silhouettes.h"
 #include "../core/voxels.h"
@@ -40,8 +41,8 @@ class Workspace {
 static thread_local Workspace workspace;
 
 // Calls f(marcher) with the degree and the opacity's kind resolved and room for a bundle of the longest rays.
-template <class Real, class F>
-void with_marcher(const Field<Real>& field, const RaySettings<Real>& settings, const F& f) {
+template <class Real, class Stored, class F>
+void with_marcher(const Field<Real, Stored>& field, const RaySettings<Real>& settings, const F& f) {
   const int64_t capacity = trace_capacity(field, settings.step);
   const auto with_opacity = [&](const auto& opacity) {
     using Opacity = std::decay_t<decltype(opacity)>;
@@ -51,7 +52,7 @@ void with_marcher(const Field<Real>& field, const RaySettings<Real>& settings, c
                                      reinterpret_cast<Footprints<Real>*>(memory + (sample_bytes + 63) / 64 * 64),
                                      capacity};
     with_degree(field.pitch, [&](auto degree) {
-      f(Marcher<Real, decltype(degree)::value, Opacity>(field, settings, opacity, trace));
+      f(Marcher<Real, decltype(degree)::value, Opacity, Stored>(field, settings, opacity, trace));
     });
   };
   if (settings.opacity == 0)
@@ -80,13 +81,13 @@ void march_backward(const Field<Real>& field, const Rays<Real>& rays, const RayS
   });
 }
 
-template <class Real>
-void photometric_step(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+template <class Real, class Stored, class Sum>
+void photometric_step(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
                       const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin, int64_t end,
-                      double* losses, Real* color, Real* transmittance, Real* gradient) {
-  Real spare[32] = {};
-  with_marcher(field, settings, [&]<int Degree, class Opacity>(const Marcher<Real, Degree, Opacity>& march) {
-    const ToVoxels<Real, Degree> to{gradient, spare};
+                      double* losses, Real* color, Real* transmittance, Sum* gradient) {
+  Sum spare[32] = {};
+  with_marcher(field, settings, [&]<int Degree, class Opacity>(const Marcher<Real, Degree, Opacity, Stored>& march) {
+    const ToVoxels<Real, Degree, Sum> to{gradient, spare};
     photometric_rays(march, rays, seen, loss, begin, end, losses, color, transmittance, to);
   });
 }
@@ -99,8 +100,8 @@ template <class Real, class F> void with_slots(bool narrow, const void* slots, c
     f(static_cast<const Real*>(slots));
 }
 
-template <class Real>
-void photometric_lattice(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+template <class Real, class Stored>
+void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
                          const Observation<Real>& seen, const PhotometricSettings<Real>& loss,
                          const SlotRows<Real>& rows, bool narrow, int64_t begin, int64_t end, double* losses,
                          Real* color, Real* transmittance, void* slots) {
@@ -113,7 +114,7 @@ void photometric_lattice(const Field<Real>& field, const Rays<Real>& rays, const
 }
 
 template <class Real>
-void gather_gradient(const Field<Real>& field, const int32_t* coordinates, const SlotCameras<Real>& cameras,
+void gather_gradient(const Grid<Real>& field, const int32_t* coordinates, const SlotCameras<Real>& cameras,
                      const SlotRows<Real>& rows, bool narrow, const void* slots, int64_t begin, int64_t end,
                      Real* gradient) {
   with_slots<Real>(narrow, slots, [&]<class Slot>(const Slot* typed) {
@@ -125,9 +126,19 @@ void gather_gradient(const Field<Real>& field, const int32_t* coordinates, const
   });
 }
 
-template <class Real>
-void integration_ranges(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, Real quiet,
-                        int64_t begin, int64_t end, int64_t* counts, std::vector<Real>& ranges) {
+template <class Sum> void add_sums(Sum* total, const Sum* more, int64_t begin, int64_t end) {
+  constexpr int kRow = 16;  // records of whole tiles are whole rows
+  for (int64_t i = begin; i < end; i += kRow) {
+    if constexpr (std::is_same_v<Sum, Half>)
+      add_to<float, kRow>(total + i, from_halves<kRow>(more + i));
+    else
+      add_to<Sum, kRow>(total + i, load<Sum, kRow>(more + i));
+  }
+}
+
+template <class Real, class Stored>
+void integration_ranges(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                        Real quiet, int64_t begin, int64_t end, int64_t* counts, std::vector<Real>& ranges) {
   std::vector<Real> room(2 * trace_capacity(field, settings.step));
   with_marcher(field, settings, [&](const auto& march) {
     for (int64_t i = begin; i < end; ++i) {
@@ -137,9 +148,9 @@ void integration_ranges(const Field<Real>& field, const Rays<Real>& rays, const 
   });
 }
 
-template <class Real>
-void visibility(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, int64_t begin,
-                int64_t end, Real* seen) {
+template <class Real, class Stored>
+void visibility(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                int64_t begin, int64_t end, Real* seen) {
   with_marcher(field, settings, [&](const auto& march) {
     for (int64_t i = begin; i < end; ++i) visibility_ray(march, rays, i, seen);
   });
@@ -176,11 +187,10 @@ template <class Real, class Point>
 void read_points(const Field<Real>& field, int64_t begin, int64_t end, const Point& point, Real* values) {
   with_degree(field.pitch, [&](auto degree) {
     using R = Record<decltype(degree)::value>;
-    Real missing[2 * R::kPitch];
-    fill_missing<Real, decltype(degree)::value>(field, missing);
+    const Code<Real, decltype(degree)::value, Real> code(field);
     for_points(field, begin, end, point, [&](const Footprints<Real>& at, int count, int64_t first) {
       for (int l = 0; l < count; ++l) {
-        const auto record = interpolate<Real, decltype(degree)::value>(field, missing, at, l);
+        const auto record = interpolate(field, code, at, l);
         for (int p = 0; p < R::kParts; ++p)
           store<Real, R::kPart>(values + (first + l) * R::kPitch + p * R::kPart, record.part[p]);
       }
@@ -225,22 +235,27 @@ void upscale(const Field<Real>& coarse, const Field<Real>& fine, const int32_t* 
   read_points(coarse, begin * kTileVoxels, end * kTileVoxels, center, voxels);
 }
 
-template <class Real>
-void voxel_terms(const Field<Real>& field, const int32_t* coordinates, const VoxelTerms<Real>& terms, int64_t begin,
-                 int64_t end, double* losses, Real* gradient) {
+template <class Real, class Stored, class Sum>
+void voxel_terms(const Field<Real, Stored>& field, const int32_t* coordinates, const VoxelTerms<Real>& terms,
+                 int64_t begin, int64_t end, double* losses, Sum* gradient) {
   with_degree(field.pitch, [&](auto degree) {
+    const Code<Real, decltype(degree)::value, Stored> code(field);
     for (int64_t t = begin; t < end; ++t)
-      voxel_terms_tile<Real, decltype(degree)::value>(field, coordinates + 3 * t, terms, t, losses, gradient);
+      voxel_terms_tile(field, code, coordinates + 3 * t, terms, t, losses, gradient);
   });
 }
 
-template <class Real>
-void adam_step(Real* value, const Real* gradient, Real* first, Real* second, int32_t pitch, int64_t begin, int64_t end,
-               const AdamSettings<Real>& adam) {
-  const int64_t at = begin * pitch;
+// On the tiles begin .. end.
+template <class Real, class Stored, class Sum>
+void adam_step(Stored* value, const Sum* gradient, MomentOf<Stored>* first, MomentOf<Stored>* second, int32_t pitch,
+               int64_t begin, int64_t end, const AdamSettings<Real>& adam) {
+  const int64_t tile = int64_t(kTileVoxels) * pitch, at = begin * tile;
   with_degree(pitch, [&](auto degree) {
-    adam_records<Real, Record<decltype(degree)::value>::kPitch>(value + at, gradient + at, first + at, second + at,
-                                                                end - begin, adam);
+    constexpr int kPitch = Record<decltype(degree)::value>::kPitch;
+    if constexpr (std::is_same_v<Stored, Real>)
+      adam_records<Real, kPitch>(value + at, gradient + at, first + at, second + at, (end - begin) * kTileVoxels, adam);
+    else
+      adam_codes<kPitch>(value, gradient, first, second, at, end * tile, adam);
   });
 }
 
@@ -250,18 +265,25 @@ void soft_hull(const Silhouettes<Real>& silhouettes, const Real* points, int64_t
   for (int64_t i = begin; i < end; ++i) value[i] = soft_hull_point(silhouettes, points + 3 * i, votes[i]);
 }
 
+// One initialiser per kind of table.
+template <class Table> struct Filled;
+template <class Real> struct Filled<Kernels<Real>> {
+  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,      sample_forward<Real>, sample_backward<Real>,
+                                       march_forward<Real>,   march_backward<Real>, find_reach<Real>,
+                                       gather_gradient<Real>, soft_hull<Real>,      upscale<Real>};
+};
+template <class Real, class Stored, class Sum> struct Filled<FitKernels<Real, Stored, Sum>> {
+  static constexpr FitKernels<Real, Stored, Sum> table{
+      photometric_step<Real, Stored, Sum>, photometric_lattice<Real, Stored>, add_sums<Sum>,
+      integration_ranges<Real, Stored>,    visibility<Real, Stored>,          voxel_terms<Real, Stored, Sum>,
+      adam_step<Real, Stored, Sum>};
+};
+
 }  // namespace SURFCAP_ISA
 
 namespace SURFCAP_ISA {
-template <class Real> const Kernels<Real>& kernels() {
-  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,          sample_forward<Real>, sample_backward<Real>,
-                                       march_forward<Real>,       march_backward<Real>, photometric_step<Real>,
-                                       photometric_lattice<Real>, find_reach<Real>,     gather_gradient<Real>,
-                                       integration_ranges<Real>,  visibility<Real>,     voxel_terms<Real>,
-                                       adam_step<Real>,           soft_hull<Real>,      upscale<Real>};
-  return table;
-}
-template const Kernels<float>& kernels<float>();
-template const Kernels<double>& kernels<double>();
+template <class Table> const Table& kernels() { return Filled<Table>::table; }
+#define SURFCAP_KERNELS(...) template const __VA_ARGS__& kernels<__VA_ARGS__>()
+SURFCAP_ALL_TABLES(SURFCAP_KERNELS);
 }  // namespace SURFCAP_ISA
 }  // namespace surfcap

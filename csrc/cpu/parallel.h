@@ -34,23 +34,21 @@ template <class F> void parallel_ranges(int64_t count, int64_t grain, const F& f
 
 // Calls work(begin, end, buffer, group) for all chunks of 0..count, chunk c in group c mod groups, each group with its
 // own zeroed buffer of `size` numbers, the first being `total` and the others following one another in `rest`; then
-// combines the buffers into `total` group by group.
-template <class Real, class Work, class Combine>
-void grouped(int64_t count, int64_t groups, int64_t size, Real* total, Real* rest, const Work& work,
+// combines the buffers into `total` group by group: combine(total, buffer, begin, end), tile by tile.
+template <class Number, class Work, class Combine>
+void grouped(int64_t count, int64_t groups, int64_t size, Number* total, Number* rest, const Work& work,
              const Combine& combine) {
   const int64_t chunks = (count + kChunk - 1) / kChunk;
   parallel_ranges(groups, 1, [&](int64_t first, int64_t last) {
     for (int64_t g = first; g < last; ++g) {
-      Real* const buffer = g == 0 ? total : rest + (g - 1) * size;
-      std::fill(buffer, buffer + size, Real(0));
+      Number* const buffer = g == 0 ? total : rest + (g - 1) * size;
+      std::fill(buffer, buffer + size, Number{});
       for (int64_t c = g; c < chunks; c += groups) work(c * kChunk, std::min(count, (c + 1) * kChunk), buffer, g);
     }
   });
-  parallel_ranges(size, 1 << 14, [&](int64_t begin, int64_t end) {
-    for (int64_t g = 1; g < groups; ++g) {
-      const Real* const buffer = rest + (g - 1) * size;
-      for (int64_t i = begin; i < end; ++i) total[i] = combine(total[i], buffer[i]);
-    }
+  parallel_ranges(size / kVoxelsPerTile, 1 << 8, [&](int64_t begin, int64_t end) {
+    for (int64_t g = 1; g < groups; ++g)
+      combine(total, rest + (g - 1) * size, begin * kVoxelsPerTile, end * kVoxelsPerTile);
   });
 }
 
@@ -69,7 +67,8 @@ void grouped(const Tensor& like, int64_t count, int64_t groups, int64_t size, Re
 
 template <class Real, class Work>
 void grouped_sum(const Tensor& like, int64_t count, int64_t groups, int64_t size, Real* total, const Work& work) {
-  grouped(like, count, groups, size, total, work, [](Real a, Real b) { return a + b; });
+  const auto add = best<FitKernels<Real, Real, Real>>().add_sums;
+  grouped(like, count, groups, size, total, work, add);
 }
 
 }  // namespace surfcap

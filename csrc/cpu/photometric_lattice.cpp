@@ -6,17 +6,19 @@ namespace surfcap {
 
 constexpr int64_t kLossGroups = 64;  // sums of losses, so that the values do not depend on the threads
 
-template <class Real, class... Common>
+template <class Types, class... Common>
 StepResult photometric_lattice_typed(const Tensor& starts, const Tensor& first, int64_t exponent, const Tensor& slots,
                                      const Common&... common) {
-  const PhotometricArgument<Real> step(common...);
+  using Real = typename Types::Real;
+  const PhotometricArgument<Real, typename Types::Stored> step(common...);
   const SlotRowsArgument<Real> rows(starts, first, exponent, slots, step.rays.view.count);
   void* const to = slots.mutable_data_ptr();
-  return photometric<Real>(
-      step, kLossGroups, 0, nullptr, [&](int64_t begin, int64_t end, double* losses, Real* color, Real* left, Real*) {
-        best_kernels<Real>().photometric_lattice(step.field.view, step.rays.view, step.settings, step.seen, step.loss,
-                                                 rows.view, rows.narrow, begin, end, losses, color, left, to);
-      });
+  const auto work = [&](int64_t begin, int64_t end, double* losses, Real* color, Real* left, Real*) {
+    fit_kernels<Types>().photometric_lattice(step.field.view, step.rays.view, step.settings, step.seen, step.loss,
+                                             rows.view, rows.narrow, begin, end, losses, color, left, to);
+  };
+  const auto nothing = [](Real*, const Real*, int64_t, int64_t) {};
+  return photometric(step, kLossGroups, 0, static_cast<Real*>(nullptr), work, nothing);
 }
 
 StepResult photometric_lattice(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins,
@@ -25,9 +27,11 @@ StepResult photometric_lattice(Tensor voxels, Tensor table, std::vector<double> 
                                int64_t opacity, double slope, double step, double stop, double huber,
                                std::vector<double> weights, bool detach_sample, bool rendered_sample, Tensor starts,
                                Tensor first, int64_t exponent, Tensor slots) {
-  return SURFCAP_BY_TYPE(voxels, photometric_lattice_typed, starts, first, exponent, slots, voxels, table, frame,
-                         origins, directions, shift, background, target, mask, weight, range_offsets, ranges, opacity,
-                         slope, step, stop, huber, weights, detach_sample, rendered_sample);
+  return by_storage(voxels, origins.scalar_type(), [&](auto types) {
+    return photometric_lattice_typed<decltype(types)>(
+        starts, first, exponent, slots, voxels, table, frame, origins, directions, shift, background, target, mask,
+        weight, range_offsets, ranges, opacity, slope, step, stop, huber, weights, detach_sample, rendered_sample);
+  });
 }
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("photometric_lattice", TORCH_BOX(&photometric_lattice)); }

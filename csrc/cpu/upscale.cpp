@@ -8,7 +8,7 @@ Tensor upscale_typed(const Tensor& voxels, const Tensor& table, const std::vecto
                      const Tensor& fine_coordinates, const std::vector<double>& fine_frame) {
   const FieldArgument<Real> coarse(voxels, table, frame);
   const Input<int32_t> places("fine_coordinates", fine_coordinates, {kAny, 3});
-  Field<Real> fine = field_view(coarse.voxels, coarse.table, fine_frame);  // only its frame is read
+  Field<Real> fine = field_view<Real>(coarse.voxels, coarse.table, fine_frame);  // only its frame is read
   const int64_t tiles = fine_coordinates.size(0);
   const Tensor out = torch::stable::new_empty(voxels, {tiles, kTileSide, kTileSide, kTileSide, coarse.view.pitch});
   Real* const values = out.template mutable_data_ptr<Real>();

@@ -12,7 +12,8 @@ from torch import Tensor
 from tests.fitting.sphere import ball
 from tests.fitting.stages import begun
 from torch_surfcap import ops
-from torch_surfcap.fitting.adam import BOUNDS, TileAdam
+from torch_surfcap.field.field import MISSING
+from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.budget import GROUP_BYTES, GROUPS, gradient_groups
 from torch_surfcap.fitting.descent import descend
 from torch_surfcap.fitting.plateau import Plateau
@@ -98,7 +99,7 @@ def test_rates_and_bounds(degree: int, opacity: str) -> None:
     for sign in (1.0, -1.0):
         for _ in range(1500):
             adam.step(sign * torch.ones_like(store))
-        low, high = BOUNDS[opacity]
+        high, low = MISSING[opacity]
         bound = torch.tensor([low, 0.0, 0.0, 0.0] if sign > 0 else [high, 1.0, 1.0, 1.0])
         assert torch.equal(store[0, 0, 0, 0, :4], bound)
         assert (store[..., 4:count] == -sign).all()

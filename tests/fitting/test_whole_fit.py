@@ -113,10 +113,9 @@ def test_budget_grows_with_levels_and_degree() -> None:
     plan = plan_levels(capture, box, 0.05, 3)
     bytes_by_degree = []
     for degree in (0, 1, 2):
-        grid, store = first_field(
-            capture, box, plan[0].voxel_size, FitSettings.of(opacity="distance"), degree
-        )
-        budget = estimate(capture, plan, grid, store, "distance")
+        settings = FitSettings()
+        grid, store = first_field(capture, box, plan[0].voxel_size, settings, degree)
+        budget = estimate(capture, plan, grid, store, settings)
         assert budget.level_bytes == sorted(budget.level_bytes)
         assert budget.level_bytes[0] > 4 * 3 * store.numel()
         bytes_by_degree.append(budget.level_bytes[-1])

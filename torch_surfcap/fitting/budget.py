@@ -12,12 +12,14 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.settings import FitSettings
 
 if TYPE_CHECKING:
     from torch_surfcap.fitting.levels import Level
 
 GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
 GROUPS = (4, 32)  # fewest, most
+CODE_GROUPS = 2  # the same beside codes, whose reason is to save memory
 BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
 SURFACE = {"transparency": 0.99, "distance": 0.0}  # opacity value on the hull's surface, where a fit starts
 AREA_PER_BORDER = 0.6  # voxel faces of area per voxel at the border of a ball, counted
@@ -36,18 +38,20 @@ class Budget:
     seconds: float
 
 
-def estimate(capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor, opacity: str) -> Budget:
+def estimate(
+    capture: Capture, plan: list[Level], grid: TileGrid, store: Tensor, settings: FitSettings
+) -> Budget:
     """The budget of a fit whose first level has this grid: surfaces grow by 4 per level, and so do pictures."""
     assert capture.masks is not None
     pixels = sum(float(mask.sum()) for mask in capture.masks)
     pitch = store.shape[-1]
-    area = _surface_tiles(grid, store[..., 0] < SURFACE[opacity])
+    area = _surface_tiles(grid, store[..., 0] < SURFACE[settings.opacity])
     level_bytes, samples = [], 0.0
     for number, level in enumerate(plan):
         tiles = len(store) if number == 0 else TILES_PER_AREA * area * 4**number
         numbers = int(tiles * ops.TILE**3 * pitch)
         rays = RAY_MARGIN * pixels / 4**level.halvings
-        level_bytes.append(int(4 * numbers * (3 + gradient_groups(numbers)) + BYTES_PER_RAY * rays))
+        level_bytes.append(int(bytes_per_number(numbers, settings) * numbers + BYTES_PER_RAY * rays))
         samples += rays * level.iterations * SAMPLES_PER_RAY
     return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
 
@@ -57,7 +61,21 @@ def gradient_groups(numbers: int) -> int:
     return max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
 
 
+def partial_gradients(store: Tensor, accumulator: int) -> Tensor:
+    """Memory for the partial gradients [groups, T, 4, 4, 4, P] of a field of floats or codes, in so many bits."""
+    groups = gradient_groups(store.numel()) if store.is_floating_point() else CODE_GROUPS
+    return torch.empty(groups, *store.shape, dtype={32: torch.float32, 16: torch.float16}[accumulator])
+
+
 LESS = "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"
+
+
+def bytes_per_number(numbers: int, settings: FitSettings) -> float:
+    """What each of so many numbers of a field takes in training: value, two moments, partial gradients."""
+    groups = gradient_groups(numbers) if settings.storage == 32 else CODE_GROUPS
+    if settings.gradient == "gather":
+        groups = 1  # beside the slots, which are counted by samples
+    return (3 * settings.storage + groups * settings.accumulator) / 8
 
 
 def shortage(needed: int, remedy: str = LESS) -> str | None:

@@ -22,13 +22,12 @@ from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.tiles import TileGrid
-from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.levels import Level
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.rays import rays_of
 from torch_surfcap.fitting.settings import FitSettings
-from torch_surfcap.fitting.stage import Stage, Studio, march_of
+from torch_surfcap.fitting.stage import Stage, Studio, begin_adam, march_of
 from torch_surfcap.version import VERSION
 
 
@@ -80,7 +79,7 @@ class Saved:
         offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         rays = rays_of(capture, grid, list(pixels), (offsets, arrays["ranges"]))
         rays.expose(capture, studio.backdrop, studio.exposure)
-        adam = TileAdam(store, settings.opacity, settings.descent)
+        adam = begin_adam(store, settings)
         adam.first, adam.second, adam.t = arrays["first"], arrays["second"], plain["t"]
         march = march_of(settings, level, number == len(plan) - 1)
         rule = Plateau(**plain["rule"])

@@ -9,7 +9,7 @@ import torch
 
 from torch_surfcap import ops
 from torch_surfcap.field.field import MISSING
-from torch_surfcap.fitting.budget import gradient_groups
+from torch_surfcap.fitting.budget import partial_gradients
 from torch_surfcap.fitting.gathered import GatheredGradient
 from torch_surfcap.fitting.rays import find_ranges
 from torch_surfcap.fitting.settings import FitSettings
@@ -50,8 +50,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
         "rendered_sample": loss.sample_target == "rendered",
     }
     gathered = GatheredGradient(rays, grid, settings, stage.march) if settings.gradient == "gather" else None
-    groups = 0 if gathered else gradient_groups(store.numel())
-    gradients = store.new_empty(groups, *store.shape)
+    gradients = None if gathered else partial_gradients(store, settings.accumulator)
     watch = Stopwatch(stage.seconds)
     while not rule.ended:
         if stage.moved >= REFRESH:

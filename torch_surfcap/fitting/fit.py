@@ -107,7 +107,7 @@ def fit(
     if saved is None:
         grid, store = first_field(studio.pictures[-1], box, plan[0].voxel_size, s, degree)
         watch.lap("hull")
-        budget = estimate(capture, plan, grid, store, s.opacity)
+        budget = estimate(capture, plan, grid, store, s)
         so_far.level_bytes = budget.level_bytes
         report(Progress(0, len(plan), plan[0], 0, {}, budget))
         missing = short_of(plan, 0, so_far.level_bytes)
@@ -137,7 +137,7 @@ def fit(
         if checkpoints is not None:
             checkpoints.save(s, capture, box, stage, studio, so_far)
     watch.lap("fit")
-    surface = SurfaceField(stage.store, stage.grid, s.opacity)
+    surface = SurfaceField(stage.decoded(s.opacity), stage.grid, s.opacity)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:

@@ -69,7 +69,7 @@ class GatheredGradient:
         """
         store = arguments["voxels"]
         if self.gradient.shape != store.shape:
-            self.gradient = torch.empty_like(store)
+            self.gradient = self.gradient.new_empty(store.shape)
         rows: dict[str, Any] = {
             "starts": self.starts,
             "first": self.first,

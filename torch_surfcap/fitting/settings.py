@@ -82,6 +82,9 @@ class FitSettings:
     lattice:   32 or 8, bits of a number of the samples' gradients that "gather" keeps
     threshold: opacity value of the surface. smooth: rounds of Taubin smoothing of the mesh. specks: pieces under this
                fraction of the largest one's area are removed
+    storage:   bits of a coefficient during the fit, 32, 16 or 8, and of each of its moments
+    rounding:  of narrow coefficients, "stochastic" or "nearest"
+    accumulator: bits of the gradients' sums; 32, or 16 where storage is less than 32 and the gradient is scattered
     losses, descent: see there; `losses=dict(mask=0.1)` changes one entry
     """
 
@@ -101,6 +104,9 @@ class FitSettings:
     threshold: float | None = None
     smooth: int = 5
     specks: float = 0.01
+    storage: int = 32
+    rounding: str = "stochastic"
+    accumulator: int = 32
     losses: Losses = field(default_factory=Losses)
     descent: Descent = field(default_factory=Descent)
 
@@ -128,9 +134,13 @@ class FitSettings:
                 f"fit: unknown setting {sorted(unknown)[0]!r}, expected one of {', '.join(sorted(known))}"
             )
         settings = FitSettings(**given)
+        may_halve = settings.storage < 32 and settings.gradient == "scatter"
         for name, sound in (
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
             ("voxel", settings.voxel is None or settings.voxel > 0),
+            ("storage", settings.storage in (32, 16, 8)),
+            ("rounding", settings.rounding in ("stochastic", "nearest")),
+            ("accumulator", settings.accumulator in ((32, 16) if may_halve else (32,))),
             ("levels", settings.levels is None or settings.levels >= 1),
             *((name, getattr(settings, name) in words) for name, words in CHOICES.items()),
             ("losses.sample_target", settings.losses.sample_target in SAMPLE_TARGETS),

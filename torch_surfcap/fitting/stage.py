@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torch_surfcap import ops
+from torch_surfcap import codes, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
-from torch_surfcap.field.field import SLOPE
+from torch_surfcap.field.field import MISSING, SLOPE
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.color_gain import Exposure
@@ -58,7 +58,8 @@ class Studio:
 class Stage:
     """One level of the fit.
 
-    number: of the level, from 0. level: its plan. grid, store: the field, padded records [T, 4, 4, 4, P]. moved:
+    number: of the level, from 0. level: its plan. grid, store: the field, padded records [T, 4, 4, 4, P] of floats or of
+    codes (see ``torch_surfcap.codes``). moved:
     iterations at full rate since the integration ranges were found. compared: the rate at which the gathered gradient
     was held against the exact one last. seconds: spent per kind of work.
     """
@@ -75,6 +76,10 @@ class Stage:
     compared: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
 
+    def decoded(self, opacity: str) -> Tensor:
+        """The records in floats."""
+        return codes.decode(self.store, *MISSING[opacity])
+
 
 def march_of(settings: FitSettings, level: Level, last: bool) -> March:
     """How the rays of a level are sampled."""
@@ -82,16 +87,23 @@ def march_of(settings: FitSettings, level: Level, last: bool) -> March:
     return March(ops.OPACITY[settings.opacity], SLOPE, step * level.voxel_size, settings.descent.stop)
 
 
+def begin_adam(store: Tensor, settings: FitSettings) -> TileAdam:
+    """Adam at rest."""
+    stochastic = settings.rounding == "stochastic"
+    return TileAdam(store, settings.opacity, settings.descent, settings.seed, stochastic)
+
+
 def begin_stage(
     settings: FitSettings, plan: list[Level], number: int, grid: TileGrid, store: Tensor, studio: Studio
 ) -> Stage:
     """A level before its first iteration: rays gathered, Adam at rest."""
     level = plan[number]
+    store = codes.encode(store, *MISSING[settings.opacity], settings.storage)
     march = march_of(settings, level, number == len(plan) - 1)
     capture = studio.pictures[level.halvings]
     rays = gather_rays(capture, store, grid, settings.opacity, march)
     rays.expose(capture, studio.backdrop, studio.exposure)
-    adam = TileAdam(store, settings.opacity, settings.descent)
+    adam = begin_adam(store, settings)
     return Stage(number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations))
 
 
@@ -111,7 +123,7 @@ def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: S
     watch = Stopwatch({})
     if stage.number == 0 and settings.gains == "auto":
         studio.settle_gains()
-    grid, store = next_level(stage.grid, stage.store, settings, stage.rays, stage.march)
+    grid, store = next_level(stage.grid, stage.decoded(settings.opacity), settings, stage.rays, stage.march)
     following = begin_stage(settings, plan, stage.number + 1, grid, store, studio)
     watch.lap("prepare")
     following.seconds |= watch.seconds

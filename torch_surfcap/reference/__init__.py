@@ -9,6 +9,7 @@ Store: `voxels` [T,4,4,4,P] as [tile, x, y, z, coefficient], P = 4, 16, 32 for S
 value, inside value].
 """
 
+from .codes import decoded
 from .rays import (
     BASIS_OF_PITCH,
     DISTANCE,
@@ -45,6 +46,7 @@ __all__ = [
     "adam_step",
     "coded",
     "corners",
+    "decoded",
     "dense",
     "gather_gradient",
     "harmonics",

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .codes import decoded
 from .store import TILE, corners, dense, dense_index, nonempty_cells
 from .voxels import huber_norm
 
@@ -88,7 +89,7 @@ def march(
         within & nonempty_cells(table)[tile.clamp(min=0).minimum(base.new_tensor(table.shape) - 1).unbind(-1)]
     )
 
-    record = (dense(voxels, table, frame)[index.unbind(-1)] * corner[..., None]).sum(-2)
+    record = (dense(decoded(voxels, frame), table, frame)[index.unbind(-1)] * corner[..., None]).sum(-2)
     basis = BASIS_OF_PITCH[voxels.shape[-1]]
     coefficients = record[..., 1 : 1 + 3 * basis].unflatten(-1, (basis, 3))
     color = torch.einsum("rl,rklc->rkc", harmonics(directions, basis), coefficients)
@@ -197,7 +198,7 @@ def photometric_step(
     target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss. `ranges` and
     `gradients`, which save the compiled op a search and memory, are not looked at.
     """
-    leaf = voxels.detach().requires_grad_()
+    leaf = decoded(voxels, frame).detach().requires_grad_()
     m = march(leaf, table, frame, origins, directions, shift, opacity, slope, step, stop)
     losses, color, left = ray_losses(
         m, background, target, mask, weight, huber, detach_sample, rendered_sample
@@ -244,7 +245,7 @@ def visibility(
     m = march(voxels, table, frame, origins, directions, shift, opacity, slope, step, stop)
     row = dense_index(table)[m.corners.unbind(-1)]  # [R,K,8]
     reads = (row >= 0) & (m.corner_weights > 0) & m.visited[..., None]
-    seen = voxels.new_zeros(voxels.shape[0] * TILE**3, 2)
+    seen = origins.new_zeros(voxels.shape[0] * TILE**3, 2)
     for channel, quantity in enumerate((m.transmittance[:, :-1], m.weight)):
         values = quantity[..., None].expand_as(row)[reads].detach()
         seen[:, channel].scatter_reduce_(0, row[reads], values, "amax")

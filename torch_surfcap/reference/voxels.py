@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from .codes import adam_codes, decoded
 from .store import dense, dense_index
 
 
@@ -37,7 +38,7 @@ def voxel_terms(
         (table[coordinates.long().unbind(-1)] == torch.arange(len(coordinates), device=table.device)).all()
     ):
         raise ValueError("coordinates: expected the place of every tile in the table")
-    leaf = voxels.detach().requires_grad_()
+    leaf = decoded(voxels, frame).detach().requires_grad_()
     grid, stored = dense(leaf, table, frame), dense_index(table) >= 0
     tv_opacity, tv_color = leaf.new_zeros(()), leaf.new_zeros(())
     for axis in range(3):
@@ -74,12 +75,17 @@ def adam_step(
     beta1: float = 0.9,
     beta2: float = 0.99,
     epsilon: float = 1e-8,
+    seed: int = 0,
+    stochastic: bool = True,
 ) -> None:
     """One bias-corrected step of Adam (Kingma and Ba 2015), the t-th from 1, in place; then the clamp to
     [low, high].
 
     rate, low, high [P] are per coefficient.
     """
+    if not voxels.is_floating_point():
+        moments, bounds = (first, second), (rate, low, high)
+        return adam_codes(voxels, gradient, *moments, *bounds, t, beta1, beta2, epsilon, seed, stochastic)
     first.mul_(beta1).add_(gradient, alpha=1 - beta1)
     second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     step = (first / (1 - beta1**t)) / ((second / (1 - beta2**t)).sqrt() + epsilon)
