@@ -115,9 +115,7 @@ class Config:
     mesh: MeshConfig = field(default_factory=MeshConfig)
     overwrite: bool = False  # replace the results in `out`
     resume: bool = False  # go on from the checkpoint in `out`
-    checkpoint: float = _within(
-        60.0, 0
-    )  # seconds between checkpoints; there is one at every change of level too
+    checkpoint: float = _within(60.0, 0)  # seconds between checkpoints within a level
 
 
 def load(path: str | os.PathLike[str] | None = None, overrides: Sequence[str] = ()) -> Config:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.fitting.sphere import ball
 from torch_surfcap import Capture, fit
-from torch_surfcap.fitting.color_gain import Equations, Exposure
+from torch_surfcap.fitting.color_gain import FARTHEST, Equations, Exposure
 
 TRUE = torch.tensor([[1.25, 0.02], [0.8, -0.01], [1.0, 0.03], [0.9, -0.02]])  # gain and bias of four pictures
 
@@ -103,7 +103,7 @@ def test_a_ball_in_different_light(plates: bool) -> None:
     capture = Capture(images, true.cameras.K, true.cameras.world_to_camera, true.masks, plates_in)
     capture.mask_source = true.mask_source
     settings: dict[str, Any] = {"sh_degree": 0, "levels": 2, "voxel": 1 / 40}
-    result = fit(capture, **settings)
+    result = fit(capture, gains="on", **settings)
     assert result.chosen["gains"]["value"] == "on"
     error = (result.gain - (gains / gains.mean())[:, None]).abs()
     assert error.median() < 0.01
@@ -111,12 +111,25 @@ def test_a_ball_in_different_light(plates: bool) -> None:
     plain = fit(capture, gains="off", **settings)
     assert (plain.gain == 1).all()
     assert not plain.gains
-    assert plain.chosen["gains"]["spread"] is None
+    assert plain.chosen["gains"]["spread"] == 0
     assert result.history[-1]["photo"] < 0.5 * plain.history[-1]["photo"]
 
 
-def test_equal_cameras_are_left_alone() -> None:
-    result = fit(ball(12, 48), sh_degree=0, levels=2, voxel=1 / 40)
-    assert result.chosen["gains"]["value"] == "off"
-    assert result.chosen["gains"]["spread"] < 0.01
-    assert (result.gain == 1).all()
+def test_gains_come_with_plates() -> None:
+    quick: dict[str, Any] = {"sh_degree": 0, "levels": 1, "voxel": 1 / 20}
+    assert fit(ball(6, 32, plates=True), **quick).gains
+    assert not fit(ball(6, 32), **quick).gains
+
+
+def test_a_camera_that_shows_something_else() -> None:
+    """Its exposure is held to twice or half the others', which stay as they are."""
+    field = torch.rand(3, 5000, 3)
+    seen = [
+        Equations.of(field[0], field[0]),
+        Equations.of(field[1], field[1]),
+        Equations.of(field[0], field[2]),
+    ]
+    found = Equations.joined(seen).solve()
+    torch.testing.assert_close(
+        found.gain[:, 0], torch.tensor([1.0, 1.0, FARTHEST]) / (4 / 3), rtol=0.01, atol=0
+    )

@@ -67,7 +67,6 @@ class Saved:
         """The stage as it was; the studio gets its exposure and random numbers back."""
         arrays, plain = {name: torch.from_numpy(a) for name, a in self.arrays.items()}, self.plain
         studio.exposure = Exposure(arrays["gain"], arrays["bias"])
-        studio.gains, studio.spread = plain["gains"], plain["spread"]
         studio.generator.set_state(arrays["generator"])
         x, y, z = plain["origin"]
         grid = TileGrid(arrays["table"], arrays["coords"], (x, y, z), plain["voxel_size"])
@@ -140,9 +139,7 @@ class Checkpoints:
             "t": stage.adam.t,
             "origin": grid.origin,
             "voxel_size": grid.voxel_size,
-            "gains": studio.gains,
             "rays_per_camera": np.diff(rays.camera_starts).tolist(),
-            "spread": studio.spread,
             "box": torch.stack(box).tolist(),
             "record": asdict(record),
         }

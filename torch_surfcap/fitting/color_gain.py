@@ -3,11 +3,11 @@
 The field is seen by all cameras, so where it is opaque its colour is what they agree on. With F = sum w c the field's
 own part of a ray and T its transmittance, camera i's gain g and bias b are those that minimise
 
-    sum over rays  (g (P - T B) + b (1 - T) - F)^2                   P photograph, B plate
+    sum over rays  (P - T B - (F - b (1 - T))/g)^2                   P photograph, B plate
 
-per channel, over rays that end in the field and pixels that are not saturated. Against the full rendering instead of F
-the background would vote for the gain that it was made with. The cameras are solved together, in closed form, with
-mean g = 1 and mean b = 0: else the field and all gains could darken together.
+per channel, linear in 1/g and b/g, over rays that end in the field and pixels that are not saturated. Against the full
+rendering instead of F the background would vote for the gain that it was made with. Of all solutions that one is taken
+which has mean g = 1 and mean b = 0: else the field and all gains could darken together.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from torch import Tensor
 
 SATURATED = 0.01  # values nearer than this to 0 or 1 are clipped, or averages of clipped ones
 OPAQUE = 0.5  # a ray of less transmittance shows the field
-PRIOR = 1e-3  # a camera that sees next to nothing stays at g = 1, b = 0: weight of that, in rays
+# What is known beforehand of 1/g and b/g: 1 and 0 to within these deviations, and a ray to within its own.
+GAIN_DEVIATION, BIAS_DEVIATION, RAY_DEVIATION = 0.3, 0.05, 0.05
+FARTHEST = 2.0  # factor between a camera's exposure and the common one, held to
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,12 @@ class Exposure:
 
 @dataclass(frozen=True)
 class Equations:
-    """Normal equations of cameras' gain and bias per channel: matrix [N, 3, 2, 2], right side [N, 3, 2], float64."""
+    """Normal equations of P - T B = F/g - (b/g) (1 - T), per camera and channel: matrix [N, 3, 2, 2], right side
+    [N, 3, 2]; float64.
+
+    The photograph is explained by the field, not the field by the photograph: it is the photographs that are noisy, and
+    noise in what explains flattens the slope.
+    """
 
     matrix: Tensor
     right: Tensor
@@ -71,12 +78,14 @@ class Equations:
         by = torch.stack([field, (1 - through).expand_as(field)], -1)
         by = (by * usable[:, :, None]).double()
         matrix = torch.einsum("mci,mcj->cij", by, by)
-        right = torch.einsum("mci,mc->ci", by, (photograph - through * behind).double())
+        seen = (photograph - through * behind).double() * usable
+        right = torch.einsum("mci,mc->ci", by, seen)
         return Equations(matrix[None], right[None])
 
     @staticmethod
     def joined(cameras: list[Equations]) -> Equations:
-        return Equations(torch.cat([e.matrix for e in cameras]), torch.cat([e.right for e in cameras]))
+        parts = ([getattr(e, name) for e in cameras] for name in ("matrix", "right"))
+        return Equations(*(torch.cat(part) for part in parts))
 
     def solve(self, per_channel: bool = True, gauge: bool = True) -> Exposure:
         """The least-squares gains and biases.
@@ -89,11 +98,11 @@ class Equations:
         matrix, right = self.matrix, self.right
         if not per_channel:
             matrix, right = matrix.sum(1, keepdim=True), right.sum(1, keepdim=True)
-        start = torch.tensor([1.0, 0.0], dtype=torch.float64)
-        matrix = matrix + PRIOR * torch.eye(2, dtype=torch.float64)
-        right = right + PRIOR * start
+        prior = RAY_DEVIATION**2 / torch.tensor([GAIN_DEVIATION, BIAS_DEVIATION], dtype=torch.float64) ** 2
+        matrix = matrix + torch.diag(prior)
+        right = right + prior * torch.tensor([1.0, 0.0], dtype=torch.float64)
         slope, offset = torch.linalg.solve(matrix, right).expand(-1, 3, -1).unbind(-1)
-        gain = 1 / slope
+        gain = 1 / slope.clamp(1 / FARTHEST, FARTHEST)
         bias = -offset * gain
         if gauge:
             scale = 1 / gain.mean(0)

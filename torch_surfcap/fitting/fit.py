@@ -187,8 +187,8 @@ def _chosen(
         "mask": {"value": s.losses.mask, "reason": f"silhouettes by {studio.pictures[0].mask_source}"},
         "gains": {
             "value": "on" if studio.gains else "off",
-            "spread": studio.spread,
-            "reason": "found at the coarsest level" if s.gains == "auto" else "given",
+            "spread": studio.exposure.spread(),
+            "reason": "given" if s.gains != "auto" else "plates" if studio.gains else "no plates",
             "cameras": {
                 name: {"gain": gain.tolist(), "bias": bias.tolist()}
                 for name, gain, bias in zip(

@@ -20,16 +20,13 @@ from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, gather_rays
 from torch_surfcap.fitting.settings import FitSettings
 
-NOTICEABLE = 0.01  # change of a medium brightness by gain and bias, the median over the cameras
-
 
 @dataclass
 class Studio:
     """What does not belong to one level: the photographs at every size and the cameras' exposure.
 
     pictures: the capture, halved 0, 1, ... times. backdrop: see ``RayBatch.expose``. generator: of the lattices' shifts.
-    gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera. spread: how
-    much the cameras were found to differ, see ``Exposure.spread``.
+    gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera.
     """
 
     pictures: list[Capture]
@@ -38,20 +35,13 @@ class Studio:
     gains: bool
     per_channel: bool
     generator: torch.Generator
-    spread: float | None = None
 
     def fit_exposure(self, stage: Stage, color: Tensor, transmittance: Tensor) -> None:
         """Takes the cameras' gains out of renderings of a stage's rays, [R, 3] and [R], and exposes the rays anew."""
         capture = self.pictures[stage.level.halvings]
         equations = stage.rays.equations(capture, self.backdrop, color, transmittance)
         self.exposure = equations.solve(self.per_channel)
-        self.spread = self.exposure.spread()
         stage.rays.expose(capture, self.backdrop, self.exposure)
-
-    def settle_gains(self) -> None:
-        """Leaves the pictures as they are for good if the gains found so far are too small to matter."""
-        if self.spread is not None and self.spread < NOTICEABLE:
-            self.gains, self.exposure = False, Exposure.equal(len(self.pictures[0]))
 
 
 @dataclass
@@ -115,14 +105,13 @@ def open_studio(capture: Capture, settings: FitSettings, halvings: int) -> Studi
     generator = torch.Generator().manual_seed(settings.seed)
     equal = Exposure.equal(len(capture))
     per_channel = settings.gain_per == "channel"
-    return Studio(pictures, choose_backdrop(capture), equal, settings.gains != "off", per_channel, generator)
+    gains = settings.gains == "on" or (settings.gains == "auto" and capture.plates is not None)
+    return Studio(pictures, choose_backdrop(capture), equal, gains, per_channel, generator)
 
 
 def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:
     """The level after one that is done."""
     watch = Stopwatch({})
-    if stage.number == 0 and settings.gains == "auto":
-        studio.settle_gains()
     grid, store = next_level(stage.grid, stage.decoded(settings.opacity), settings, stage.rays, stage.march)
     following = begin_stage(settings, plan, stage.number + 1, grid, store, studio)
     watch.lap("prepare")
