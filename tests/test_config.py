@@ -150,6 +150,15 @@ def test_threshold_beyond_the_values(threshold: str) -> None:
         config.resolved(config.load(None, ["mesh.threshold=1.5", "opacity=transparency"]))
 
 
+def test_on_and_off_are_words() -> None:
+    """Though YAML takes them for true and false."""
+    assert [config.load(None, [f"gains={word}"]).gains for word in ("on", "off", "auto")] == [
+        "on",
+        "off",
+        "auto",
+    ]
+
+
 def test_losses_and_descent_mirror_the_library() -> None:
     for mine, theirs in ((config.LossesConfig, Losses), (config.DescentConfig, Descent)):
         assert [f.name for f in fields(mine)] == [f.name for f in fields(theirs)]

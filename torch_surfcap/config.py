@@ -279,6 +279,8 @@ def _merge(config: DictConfig, given: DictConfig, source: str) -> DictConfig:
             if inner:
                 raise InputError(f"{source}: {key} is {value!r}, expected keys such as {min(inner)}")
             raise InputError(f"{source}: unknown key {key}, nearest known key: {_nearest(key, known)}")
+        if key in _SAYS_ON and isinstance(value, bool):
+            value = "on" if value else "off"
         try:
             OmegaConf.update(config, key, None if value == "auto" and key not in _SAYS_AUTO else value)
         except OmegaConfBaseException as error:
@@ -333,4 +335,5 @@ def _check(config: Any, source: str, prefix: str = "") -> None:
 
 
 # Fields in which "auto" is a word like any other.
+_SAYS_ON = {"gains"}  # and on and off, which YAML takes for true and false
 _SAYS_AUTO = {"data.format", "device", "gains"}
