@@ -150,7 +150,7 @@ template <class Real> struct RaysArgument {
         directions("directions", d, {o.size(0), 3}),
         shift("shift", s, {o.size(0)}),
         background("background", b, {o.size(0), 3}),
-        view{origins.data(), directions.data(), shift.data(), background.data(), o.size(0), nullptr, nullptr} {}
+        view{origins.data(), directions.data(), shift.data(), background.data(), o.size(0), nullptr, nullptr, 1} {}
 };
 
 // The integration ranges of rays, where the caller has them.
@@ -158,17 +158,20 @@ template <class Real> struct RangesArgument {
   std::optional<Input<int64_t>> offsets;
   std::optional<Input<Real>> ranges;
 
-  RangesArgument(const std::optional<Tensor>& o, const std::optional<Tensor>& r, Rays<Real>& rays) {
+  RangesArgument(const std::optional<Tensor>& o, const std::optional<Tensor>& r, int64_t bundle, Rays<Real>& rays) {
+    STD_TORCH_CHECK(bundle >= 1, "bundle: expected at least 1 ray, got ", bundle);
     STD_TORCH_CHECK(o.has_value() == r.has_value(), "range_offsets, ranges: expected both or neither");
     if (!o) return;
-    offsets.emplace("range_offsets", *o, Shape{rays.count + 1});
+    const int64_t lists = (rays.count + bundle - 1) / bundle;
+    offsets.emplace("range_offsets", *o, Shape{lists + 1});
     ranges.emplace("ranges", *r, Shape{kAny, 2});
-    STD_TORCH_CHECK(offsets->data()[rays.count] == r->size(0), "range_offsets: expected to end with ", r->size(0),
-                    ", the number of ranges, got ", offsets->data()[rays.count]);
-    STD_TORCH_CHECK(offsets->data()[0] == 0 && std::is_sorted(offsets->data(), offsets->data() + rays.count + 1),
+    STD_TORCH_CHECK(offsets->data()[lists] == r->size(0), "range_offsets: expected to end with ", r->size(0),
+                    ", the number of ranges, got ", offsets->data()[lists]);
+    STD_TORCH_CHECK(offsets->data()[0] == 0 && std::is_sorted(offsets->data(), offsets->data() + lists + 1),
                     "range_offsets: expected numbers that begin with 0 and do not fall");
     rays.range_offsets = offsets->data();
     rays.ranges = ranges->data();
+    rays.bundle = bundle;
   }
 };
 
@@ -191,12 +194,12 @@ template <class Real, class Stored> struct PhotometricArgument {
   PhotometricArgument(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
                       const Tensor& origins, const Tensor& directions, const Tensor& shift, const Tensor& background,
                       const Tensor& photograph, const Tensor& silhouette, const Tensor& importance,
-                      const std::optional<Tensor>& range_offsets, const std::optional<Tensor>& ranges, int64_t opacity,
-                      double slope, double step, double stop, double huber, const std::vector<double>& weights,
-                      bool detach_sample, bool rendered_sample)
+                      const std::optional<Tensor>& range_offsets, const std::optional<Tensor>& ranges, int64_t bundle,
+                      int64_t opacity, double slope, double step, double stop, double huber,
+                      const std::vector<double>& weights, bool detach_sample, bool rendered_sample)
       : field(voxels, table, frame),
         rays(origins, directions, shift, background),
-        stretches(range_offsets, ranges, rays.view),
+        stretches(range_offsets, ranges, bundle, rays.view),
         settings(ray_settings<Real>(opacity, slope, step, stop)),
         target("target", photograph, {rays.view.count, 3}),
         mask("mask", silhouette, {rays.view.count}),

@@ -5,8 +5,9 @@
 #define FIELD "Tensor voxels, Tensor table, float[] frame"
 #define RAYS "Tensor origins, Tensor directions, Tensor shift, Tensor background"
 #define MARCH "int opacity, float slope, float step, float stop"
-#define PHOTOMETRIC                                                                                            \
-  FIELD ", " RAYS ", Tensor target, Tensor mask, Tensor weight, Tensor? range_offsets, Tensor? ranges, " MARCH \
+#define PHOTOMETRIC                                                                                              \
+  FIELD ", " RAYS                                                                                                \
+        ", Tensor target, Tensor mask, Tensor weight, Tensor? range_offsets, Tensor? ranges, int bundle, " MARCH \
         ", float huber, float[] weights, bool detach_sample, bool rendered_sample"
 #define SLOTS "Tensor starts, Tensor first, int exponent"
 

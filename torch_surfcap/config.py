@@ -74,6 +74,7 @@ class DescentConfig:
     step: float | None = _within(None, 0.1, 10)  # between samples, voxels
     last_step: float | None = _within(None, 0.1, 10)  # the same at the finest level, voxels
     jitter: float | None = _within(None, 0, 1)  # span of the random shifts of a ray's samples, steps
+    bundle: int | None = _within(None, 1)  # consecutive rays that share a list of integration ranges
     stop: float | None = _within(None, 0, 1)  # transmittance below which a ray ends
 
 

@@ -150,6 +150,7 @@ def photometric_step(
     ranges: tuple[Tensor, Tensor] | None = None,
     gradients: Tensor | None = None,
     rendered_sample: bool = False,
+    bundle: int = 1,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Value and gradient of the ray losses in one call.
 
@@ -161,6 +162,7 @@ def photometric_step(
         detach_sample: the sample loss's w_k carry no gradient.
         rendered_sample: samples are held against the ray's own rendered colour, taken for a constant, not the target.
         ranges: of the rays, as :func:`integration_ranges` gives them; they save the search for non-empty cells.
+        bundle: consecutive rays that share a list of ranges; the last bundle may have fewer.
         gradients: [groups, T, 4, 4, 4, P], memory for the partial gradients; the first one receives the sum, which is what
             is returned. Allocated where not given. For codes they may be float16: the gradient times ``HALF_SCALE``, each
             addition rounded to the nearest.
@@ -179,7 +181,7 @@ def photometric_step(
     if gradients is None:
         gradients = origins.new_empty(groups, *voxels.shape)
     losses, color, transmittance = _ops.photometric_step(
-        *field, *rays, *seen, *stretches, *march, *loss, gradients
+        *field, *rays, *seen, *stretches, bundle, *march, *loss, gradients
     )
     return losses, gradients[0], color, transmittance
 
@@ -208,6 +210,7 @@ def photometric_lattice(
     slots: Tensor,
     ranges: tuple[Tensor, Tensor] | None = None,
     rendered_sample: bool = False,
+    bundle: int = 1,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """:func:`photometric_step` with the gradient left at the samples, for :func:`gather_gradient` to read.
 
@@ -231,7 +234,7 @@ def photometric_lattice(
     rows, stretches = (starts, first, exponent, slots), ranges or (None, None)
     return cast(
         "tuple[Tensor, Tensor, Tensor]",
-        _ops.photometric_lattice(*field, *rays, *seen, *stretches, *march, *loss, *rows),
+        _ops.photometric_lattice(*field, *rays, *seen, *stretches, bundle, *march, *loss, *rows),
     )
 
 

@@ -39,9 +39,9 @@ template <class Real, int Degree, class Opacity, class Stored = Real> struct Mar
   SURFCAP_HD void start(Walk& walk, const Rays<Real>& rays, int64_t i, int slot = 0) const {
     const Cells<Real> cells(field, Line<Real>(field, rays.origins + 3 * i, rays.directions + 3 * i));
     const bool known = rays.range_offsets != nullptr;
-    const int64_t first = known ? rays.range_offsets[i] : 0;
+    const int64_t list = i / rays.bundle, first = known ? rays.range_offsets[list] : 0;
     const Lattice<Real> lattice(cells, settings.step, rays.shift[i], rays.ranges + (known ? 2 * first : 0),
-                                known ? int32_t(rays.range_offsets[i + 1] - first) : kUnknown);
+                                known ? int32_t(rays.range_offsets[list + 1] - first) : kUnknown);
     walk.start(field, lattice, rays.directions + 3 * i,
                {room.samples + slot * room.capacity, room.footprints + slot * room.capacity / kLanes, room.capacity});
   }

@@ -42,8 +42,9 @@ template <class Real> struct Rays {
   const Real* shift;       // [R] displacement of the lattice in steps
   const Real* background;  // [R, 3]
   int64_t count;
-  const int64_t* range_offsets;  // [R + 1] or null: where each ray's ranges begin
+  const int64_t* range_offsets;  // [bundles + 1] or null: where each bundle's ranges begin
   const Real* ranges;            // [M, 2] or null: the stretches of the rays to sample
+  int64_t bundle;                // consecutive rays that share a list of ranges
 };
 
 template <class Real> struct RaySettings {

@@ -24,13 +24,14 @@ StepResult photometric_lattice_typed(const Tensor& starts, const Tensor& first, 
 StepResult photometric_lattice(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins,
                                Tensor directions, Tensor shift, Tensor background, Tensor target, Tensor mask,
                                Tensor weight, std::optional<Tensor> range_offsets, std::optional<Tensor> ranges,
-                               int64_t opacity, double slope, double step, double stop, double huber,
+                               int64_t bundle, int64_t opacity, double slope, double step, double stop, double huber,
                                std::vector<double> weights, bool detach_sample, bool rendered_sample, Tensor starts,
                                Tensor first, int64_t exponent, Tensor slots) {
   return by_storage(voxels, origins.scalar_type(), [&](auto types) {
-    return photometric_lattice_typed<decltype(types)>(
-        starts, first, exponent, slots, voxels, table, frame, origins, directions, shift, background, target, mask,
-        weight, range_offsets, ranges, opacity, slope, step, stop, huber, weights, detach_sample, rendered_sample);
+    return photometric_lattice_typed<decltype(types)>(starts, first, exponent, slots, voxels, table, frame, origins,
+                                                      directions, shift, background, target, mask, weight,
+                                                      range_offsets, ranges, bundle, opacity, slope, step, stop, huber,
+                                                      weights, detach_sample, rendered_sample);
   });
 }
 

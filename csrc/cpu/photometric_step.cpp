@@ -26,13 +26,13 @@ StepResult photometric_step_typed(const Tensor& gradients, const Common&... comm
 
 StepResult photometric_step(Tensor voxels, Tensor table, std::vector<double> frame, Tensor origins, Tensor directions,
                             Tensor shift, Tensor background, Tensor target, Tensor mask, Tensor weight,
-                            std::optional<Tensor> range_offsets, std::optional<Tensor> ranges, int64_t opacity,
-                            double slope, double step, double stop, double huber, std::vector<double> weights,
-                            bool detach_sample, bool rendered_sample, Tensor gradients) {
+                            std::optional<Tensor> range_offsets, std::optional<Tensor> ranges, int64_t bundle,
+                            int64_t opacity, double slope, double step, double stop, double huber,
+                            std::vector<double> weights, bool detach_sample, bool rendered_sample, Tensor gradients) {
   return by_storage(voxels, gradients.scalar_type(), [&](auto types) {
-    return photometric_step_typed<decltype(types)>(gradients, voxels, table, frame, origins, directions, shift,
-                                                   background, target, mask, weight, range_offsets, ranges, opacity,
-                                                   slope, step, stop, huber, weights, detach_sample, rendered_sample);
+    return photometric_step_typed<decltype(types)>(
+        gradients, voxels, table, frame, origins, directions, shift, background, target, mask, weight, range_offsets,
+        ranges, bundle, opacity, slope, step, stop, huber, weights, detach_sample, rendered_sample);
   });
 }
 

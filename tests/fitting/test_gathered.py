@@ -16,7 +16,6 @@ from torch_surfcap.field.field import MISSING
 from torch_surfcap.field.tiles import voxel_centers
 from torch_surfcap.fitting.descent import RAY_ARGUMENTS, descend
 from torch_surfcap.fitting.gathered import GatheredGradient, camera_windows, slot_rows
-from torch_surfcap.fitting.rays import find_ranges
 from torch_surfcap.fitting.settings import FitSettings
 from torch_surfcap.fitting.stage import Stopwatch
 
@@ -42,7 +41,7 @@ def swollen_ball(
     away = ((points - torch.tensor(CENTER)).norm(dim=-1) - RADIUS) / voxel - 0.5
     store[..., 0] = away.clamp(-4, 4) if opacity == "distance" else (0.8 + 0.4 * away).clamp(0.01, 1.0)
     store[..., 1:4] = (color_at(points.view(-1, 3)).view(*away.shape, 3) + 0.1).clamp(0, 1)
-    rays.ranges = find_ranges(store, grid, opacity, stage.march, rays.origins, rays.directions)
+    rays.find_ranges(store, grid, opacity, stage.march)
     gathered = GatheredGradient(rays, grid, settings, stage.march)
     shift = torch.rand(views, generator=torch.Generator().manual_seed(0)) - 0.5
     loss = settings.losses
@@ -99,7 +98,7 @@ def test_rows_hold_every_shift() -> None:
     # ray without ranges has no row; none begins before 0.
     step = 0.25
     ranges = step * torch.tensor([[2.5, 4.0], [6.0, 7.0], [-0.3, 0.4]])
-    starts, first = slot_rows((torch.tensor([0, 2, 2, 3]), ranges), step)
+    starts, first = slot_rows((torch.tensor([0, 2, 2, 3]), ranges), step, 1, 3)
     assert starts.tolist() == [0, 5, 5, 6]
     assert first.tolist() == [2, 0, 0]
 

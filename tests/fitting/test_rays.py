@@ -13,7 +13,14 @@ from torch_surfcap.field.field import MISSING, SLOPE
 from torch_surfcap.field.tiles import TileGrid, voxel_centers
 from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.levels import first_field
-from torch_surfcap.fitting.rays import BLOCK, RayBatch, choose_backdrop, find_ranges, gather_rays
+from torch_surfcap.fitting.rays import (
+    BLOCK,
+    RayBatch,
+    choose_backdrop,
+    find_ranges,
+    gather_rays,
+    shared_ranges,
+)
 from torch_surfcap.fitting.settings import FitSettings
 
 center = torch.tensor(CENTER, dtype=torch.float64)
@@ -79,6 +86,40 @@ def test_samples_are_counted_over_the_ranges() -> None:
     ranges = (torch.tensor([0, 1, 2]), torch.tensor([[1.0, 2.0], [3.0, 3.5]]))
     rays = RayBatch(one, one, one, one, one[:, 0], one[:, 0], ranges, [0, 2], one[:, 0].int(), ring(1))
     assert rays.samples(0.25) == 6
+
+
+def test_bundles_share_what_any_of_their_rays_has() -> None:
+    # Rays with 1 to 2; nothing; 1.5 to 3 and 5 to 6 | 0 to 1 and 4 to 5; 1 to 2. The ranges of the last two touch.
+    stretches = torch.tensor([[1.0, 2.0], [1.5, 3.0], [5.0, 6.0], [0.0, 1.0], [4.0, 5.0], [1.0, 2.0]])
+    offsets, united = shared_ranges((torch.tensor([0, 1, 1, 3, 5, 6]), stretches), 3)
+    assert offsets.tolist() == [0, 2, 4]
+    assert united.tolist() == [[1.0, 3.0], [5.0, 6.0], [0.0, 2.0], [4.0, 5.0]]
+    offsets, united = shared_ranges((torch.zeros(6, dtype=torch.int64), stretches[:0]), 2)
+    assert offsets.tolist() == [0, 0, 0, 0]
+    assert united.shape == (0, 2)
+
+
+@pytest.mark.parametrize("opacity", OPACITIES)
+def test_bundles_take_no_other_samples_with_weight(opacity: str) -> None:
+    """Shared ranges are longer, by little for 8 rays of a row and more for 64 of a block; losses stay as they are."""
+    capture = ball()
+    grid, store, march = fitted(opacity, capture)
+    frame = grid.frame(*MISSING[opacity])
+    counts, losses = [], []
+    for bundle in (1, 8, 64):
+        rays = gather_rays(capture, store, grid, opacity, march, bundle)
+        rays.expose(capture, torch.zeros(3), Exposure.equal(len(capture)))
+        seen = (rays.background, rays.target, rays.mask, rays.weight)
+        counts.append(rays.samples(march.step))
+        losses.append(
+            ops.photometric_step(
+                store, grid.table, frame, rays.origins, rays.directions, torch.zeros_like(rays.mask), *seen,
+                *march, 0.1, [1.0, 0.3, 0.3], ranges=rays.ranges, bundle=bundle,
+            )[0]
+        )  # fmt: skip
+    assert counts[0] < counts[1] < counts[2] < 3 * counts[0]
+    for other in losses[1:]:
+        torch.testing.assert_close(other, losses[0], rtol=3e-3, atol=0)
 
 
 def test_weights_do_not_depend_on_cameras_pixels_or_voxels() -> None:

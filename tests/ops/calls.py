@@ -204,11 +204,11 @@ def raw(name: str, arguments: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
     if name == "adam_step":
         given = (*given[:7], 0.9, 0.99, 1e-8, given[7], 5, True)
     if name == "photometric_lattice":
-        given = (*given[:10], None, None, *given[10:17], False, *given[17:])
+        given = (*given[:10], None, None, 1, *given[10:17], False, *given[17:])
     if name == "photometric_step":
         voxels, groups = given[0], given[-1]
         gradients = given[3].new_empty(groups, *voxels.shape)
-        given = (*given[:10], None, None, *given[10:-1], False, gradients)
+        given = (*given[:10], None, None, 1, *given[10:-1], False, gradients)
     return getattr(torch.ops.torch_surfcap, name).default, given
 
 

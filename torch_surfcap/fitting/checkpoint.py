@@ -76,7 +76,7 @@ class Saved:
         pixels = arrays["pixels"].split(plain["rays_per_camera"])
         counts = arrays["range_counts"].long()
         offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-        rays = rays_of(capture, grid, list(pixels), (offsets, arrays["ranges"]))
+        rays = rays_of(capture, grid, list(pixels), (offsets, arrays["ranges"]), settings.descent.bundle)
         rays.expose(capture, studio.backdrop, studio.exposure)
         adam = begin_adam(store, settings)
         adam.first, adam.second, adam.t = arrays["first"], arrays["second"], plain["t"]

@@ -11,7 +11,6 @@ from torch_surfcap import ops
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.fitting.budget import partial_gradients
 from torch_surfcap.fitting.gathered import GatheredGradient
-from torch_surfcap.fitting.rays import find_ranges
 from torch_surfcap.fitting.settings import FitSettings
 from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio
 
@@ -48,6 +47,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
         "weights": ray_weights,
         "detach_sample": loss.detach_sample,
         "rendered_sample": loss.sample_target == "rendered",
+        "bundle": rays.bundle,
     }
     gathered = GatheredGradient(rays, grid, settings, stage.march) if settings.gradient == "gather" else None
     gradients = None if gathered else partial_gradients(store, settings.accumulator)
@@ -55,9 +55,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     while not rule.ended:
         if stage.moved >= REFRESH:
             stage.moved = 0.0
-            rays.ranges = find_ranges(
-                store, grid, settings.opacity, stage.march, rays.origins, rays.directions
-            )
+            rays.find_ranges(store, grid, settings.opacity, stage.march)
             if gathered:
                 gathered.lay_out()
             watch.lap("ranges")

@@ -51,7 +51,9 @@ class GatheredGradient:
 
     def lay_out(self) -> None:
         """Rows of slots for all samples within the ranges, whatever the shift."""
-        self.starts, self.first = slot_rows(self.rays.ranges, self.march.step)
+        self.starts, self.first = slot_rows(
+            self.rays.ranges, self.march.step, self.rays.bundle, len(self.rays)
+        )
         dtype = torch.uint8 if self.narrow else self.rays.origins.dtype
         self.slots = torch.empty(int(self.starts[-1]), 4, dtype=dtype)
 
@@ -109,7 +111,7 @@ class GatheredGradient:
         }
 
 
-def slot_rows(ranges: tuple[Tensor, Tensor], step: float) -> tuple[Tensor, Tensor]:
+def slot_rows(ranges: tuple[Tensor, Tensor], step: float, bundle: int, rays: int) -> tuple[Tensor, Tensor]:
     """``starts [R + 1]`` and ``first [R]`` of rows that hold every sample from a ray's first range to its last one,
     t_k = (k + 1/2 + shift) step with any shift between -1/2 and 1/2."""
     offsets, stretches = ranges
@@ -119,6 +121,7 @@ def slot_rows(ranges: tuple[Tensor, Tensor], step: float) -> tuple[Tensor, Tenso
     begin, end = stretches[offsets[:-1][some], 0].double(), stretches[offsets[1:][some] - 1, 1].double()
     first[some] = (torch.ceil(begin / step).long() - 1).clamp(min=0)
     counts[some] = (torch.ceil(end / step).long() - first[some]).clamp(min=0)
+    counts, first = (x.repeat_interleave(bundle)[:rays] for x in (counts, first))
     return torch.cat([counts.new_zeros(1), counts.cumsum(0)]), first.to(torch.int32)
 
 

@@ -30,7 +30,7 @@ class RayBatch:
 
     origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them;
     camera_starts: [N + 1], where each camera's rays begin; pixels: [R] int32, row-major number in the camera's picture;
-    cameras: of the pictures.
+    cameras: of the pictures; bundle: consecutive rays that share a list of ranges.
     """
 
     origins: Tensor
@@ -43,6 +43,7 @@ class RayBatch:
     camera_starts: list[int]
     pixels: Tensor
     cameras: Cameras
+    bundle: int = 1
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -54,8 +55,16 @@ class RayBatch:
     def samples(self, step: float) -> float:
         """How many samples, `step` apart, the integration ranges hold: what one iteration visits, but for what lies behind
         an opaque surface."""
-        begin, end = self.ranges[1].double().sum(0).tolist()
-        return (end - begin) / step
+        offsets, ranges = self.ranges
+        rays = torch.full_like(offsets[1:], self.bundle)
+        rays[-1:] = len(self) - self.bundle * (len(rays) - 1)
+        length = (ranges[:, 1] - ranges[:, 0]).double()
+        return float((length * rays.repeat_interleave(offsets.diff())).sum()) / step
+
+    def find_ranges(self, store: Tensor, grid: TileGrid, opacity: str, march: March) -> None:
+        """Sets the ranges to those of the field as it now is."""
+        found = find_ranges(store, grid, opacity, march, self.origins, self.directions)
+        self.ranges = shared_ranges(found, self.bundle)
 
     def expose(self, capture: Capture, backdrop: Tensor | None, exposure: Exposure) -> None:
         """Sets target and background in the common exposure.
@@ -96,12 +105,34 @@ class RayBatch:
         return Equations.joined(cameras)
 
 
+def shared_ranges(ranges: tuple[Tensor, Tensor], bundle: int) -> tuple[Tensor, Tensor]:
+    """Ranges (offsets, stretches) of single rays, united over bundles of consecutive ones."""
+    if bundle == 1:
+        return ranges
+    offsets, stretches = ranges
+    lists = -(-(len(offsets) - 1) // bundle)
+    ray = torch.arange(len(offsets) - 1).repeat_interleave(offsets.diff())
+    # Bundle by bundle along one line, far enough apart that a range of one never meets one of the next.
+    apart = float(stretches.max()) + 1.0 if len(stretches) else 1.0
+    moved = stretches.double() + (ray // bundle)[:, None] * apart
+    begin, order = moved[:, 0].sort(stable=True)
+    reached = moved[order, 1].cummax(0).values
+    starts = torch.cat([torch.ones(len(begin[:1]), dtype=torch.bool), begin[1:] > reached[:-1]])
+    ends = torch.cat([starts[1:], torch.ones(len(begin[:1]), dtype=torch.bool)])
+    of_bundle = (ray // bundle)[order][starts]
+    united = torch.stack([begin[starts], reached[ends]], 1) - of_bundle[:, None] * apart
+    counts = torch.bincount(of_bundle, minlength=lists)
+    return torch.cat([counts.new_zeros(1), counts.cumsum(0)]), united.to(stretches.dtype)
+
+
 def picture_at(picture: Tensor, pixels: Tensor) -> Tensor:
     """Colours [M, 3], float32 in [0, 1], of a picture [H, W, 3] at the row-major numbers [M] of pixels."""
     return float_tensor(picture.reshape(-1, 3)[pixels.long()])
 
 
-def gather_rays(capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March) -> RayBatch:
+def gather_rays(
+    capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March, bundle: int = 1
+) -> RayBatch:
     """The rays of all cameras that meet anything in the field (the others are culled), still without colours.
 
     The weight of a ray is 1/(number of views * rho), rho = (voxel * focal / distance)^2 being the pixels that a voxel's
@@ -127,11 +158,11 @@ def gather_rays(capture: Capture, store: Tensor, grid: TileGrid, opacity: str, m
         counts.append(passes[hit])
         ranges.append(stretches)
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
-    return rays_of(capture, grid, chosen, (offsets, torch.cat(ranges)))
+    return rays_of(capture, grid, chosen, shared_ranges((offsets, torch.cat(ranges)), bundle), bundle)
 
 
 def rays_of(
-    capture: Capture, grid: TileGrid, pixels: list[Tensor], ranges: tuple[Tensor, Tensor]
+    capture: Capture, grid: TileGrid, pixels: list[Tensor], ranges: tuple[Tensor, Tensor], bundle: int = 1
 ) -> RayBatch:
     """The rays through pixels, given per camera by their row-major numbers, still without colours."""
     assert capture.masks is not None
@@ -145,18 +176,8 @@ def rays_of(
         starts.append(starts[-1] + len(index))
     origins, directions, mask, weight = (torch.cat(c).contiguous() for c in zip(*parts, strict=True))
     target, background = torch.empty_like(origins), torch.empty_like(origins)
-    return RayBatch(
-        origins,
-        directions,
-        target,
-        background,
-        mask,
-        weight,
-        ranges,
-        starts,
-        torch.cat(pixels),
-        capture.cameras,
-    )
+    observed = (origins, directions, target, background, mask, weight)
+    return RayBatch(*observed, ranges, starts, torch.cat(pixels), capture.cameras, bundle)
 
 
 def pixels_per_voxel(capture: Capture, grid: TileGrid) -> Tensor:

@@ -38,6 +38,7 @@ class Descent:
     step: float = 3.0**0.5  # between samples, voxels
     last_step: float = 3.0**0.5  # the same at the finest level
     jitter: float = 1.0  # a ray's lattice is shifted by up to half this many steps, anew in every iteration
+    bundle: int = 1  # consecutive rays (8 x 8 pixels are 64) that share a list of integration ranges
     stop: float = 1e-3  # a ray ends when its transmittance is lower
 
 

@@ -91,7 +91,7 @@ def begin_stage(
     store = codes.encode(store, *MISSING[settings.opacity], settings.storage)
     march = march_of(settings, level, number == len(plan) - 1)
     capture = studio.pictures[level.halvings]
-    rays = gather_rays(capture, store, grid, settings.opacity, march)
+    rays = gather_rays(capture, store, grid, settings.opacity, march, settings.descent.bundle)
     rays.expose(capture, studio.backdrop, studio.exposure)
     adam = begin_adam(store, settings)
     return Stage(number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations))

@@ -191,6 +191,7 @@ def photometric_step(
     ranges: tuple[Tensor, Tensor] | None = None,
     gradients: Tensor | None = None,
     rendered_sample: bool = False,
+    bundle: int = 1,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Losses [3] (photo, sample: eq. 10, mask), gradient of weights · losses, colour [R,3], transmittance
     [R].

@@ -36,6 +36,7 @@ def photometric_lattice(
     slots: Tensor,
     ranges: tuple[Tensor, Tensor] | None = None,
     rendered_sample: bool = False,
+    bundle: int = 1,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Losses [3], colour [R,3], transmittance [R] as `photometric_step` gives them; writes `slots` [S,4].
 
