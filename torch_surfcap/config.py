@@ -22,7 +22,7 @@ from torch_surfcap.data.files import atomic_write
 from torch_surfcap.data.readers import FORMATS
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import MISSING
-from torch_surfcap.fitting.settings import CHOICES, LOSSES, SAMPLE_TARGETS, FitSettings
+from torch_surfcap.fitting.settings import CHOICES, LOSSES, SAMPLE_TARGETS, VISITS, FitSettings
 
 
 def _one_of(default: Any, *values: Any) -> Any:
@@ -74,6 +74,7 @@ class DescentConfig:
     step: float | None = _within(None, 0.1, 10)  # between samples, voxels
     last_step: float | None = _within(None, 0.1, 10)  # the same at the finest level, voxels
     jitter: float | None = _within(None, 0, 1)  # span of the random shifts of a ray's samples, steps
+    visit: str | None = _one_of(None, *VISITS)  # of a ray: its ranges, the cells not empty, or the box
     bundle: int | None = _within(None, 1)  # consecutive rays that share a list of integration ranges
     stop: float | None = _within(None, 0, 1)  # transmittance below which a ray ends
 

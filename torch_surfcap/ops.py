@@ -29,7 +29,8 @@ from typing import cast
 import torch
 from torch import Tensor
 
-import torch_surfcap._C  # noqa: F401  (loads the library, which registers the ops)
+import torch_surfcap._C  # (loads the library, which registers the ops)
+import torch_surfcap.shapes  # noqa: F401  (registers what they return)
 
 INSIDE = -1
 OUTSIDE = -2
@@ -387,69 +388,3 @@ def upscale(
 ) -> Tensor:
     """Trilinear read of a field at the voxel centres of finer tiles ``[F, 3]`` (table coordinates): [F, 4, 4, 4, P]."""
     return cast(Tensor, _ops.upscale(voxels, table, frame, fine_coordinates, fine_frame))
-
-
-def _register_shapes() -> None:
-    """Shape functions, so that torch.compile and opcheck know what the ops return."""
-    fake = torch.library.register_fake
-
-    @fake("torch_surfcap::sample_forward")
-    def _(voxels, table, frame, points):  # type: ignore[no-untyped-def]
-        return voxels.new_empty(points.shape[0], voxels.shape[-1])
-
-    @fake("torch_surfcap::sample_backward")
-    def _(grad_values, voxels, table, frame, points, groups):  # type: ignore[no-untyped-def]
-        return voxels.new_empty(voxels.shape)
-
-    @fake("torch_surfcap::march_forward")
-    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
-        rays = origins.shape[0]
-        return voxels.new_empty(rays, 3), voxels.new_empty(rays), voxels.new_empty(rays)
-
-    @fake("torch_surfcap::march_backward")
-    def _(grad_color, grad_transmittance, grad_depth, voxels, *rest):  # type: ignore[no-untyped-def]
-        return voxels.new_empty(voxels.shape)
-
-    @fake("torch_surfcap::photometric_step")
-    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
-        rays = origins.shape[0]
-        losses = origins.new_empty(3, dtype=torch.float64)
-        return losses, origins.new_empty(rays, 3), origins.new_empty(rays)
-
-    @fake("torch_surfcap::photometric_lattice")
-    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
-        rays = origins.shape[0]
-        losses = voxels.new_empty(3, dtype=torch.float64)
-        return losses, voxels.new_empty(rays, 3), voxels.new_empty(rays)
-
-    @fake("torch_surfcap::gather_gradient")
-    def _(*arguments):  # type: ignore[no-untyped-def]
-        return None
-
-    @fake("torch_surfcap::integration_ranges")
-    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
-        count = torch.library.get_ctx().new_dynamic_size()
-        return origins.new_empty(origins.shape[0] + 1, dtype=torch.int64), origins.new_empty(count, 2)
-
-    @fake("torch_surfcap::visibility")
-    def _(voxels, table, frame, origins, *rest):  # type: ignore[no-untyped-def]
-        return origins.new_empty(*voxels.shape[:4], 2)
-
-    @fake("torch_surfcap::voxel_terms")
-    def _(voxels, *rest):  # type: ignore[no-untyped-def]
-        return voxels.new_empty(5, dtype=torch.float64)
-
-    @fake("torch_surfcap::adam_step")
-    def _(*arguments):  # type: ignore[no-untyped-def]
-        return None
-
-    @fake("torch_surfcap::soft_hull")
-    def _(points, *rest):  # type: ignore[no-untyped-def]
-        return points.new_empty(points.shape[0]), points.new_empty(points.shape[0], dtype=torch.int32)
-
-    @fake("torch_surfcap::upscale")
-    def _(voxels, table, frame, fine_coordinates, fine_frame):  # type: ignore[no-untyped-def]
-        return voxels.new_empty(fine_coordinates.shape[0], *voxels.shape[1:])
-
-
-_register_shapes()

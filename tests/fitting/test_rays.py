@@ -163,6 +163,7 @@ def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
     grid, store, march = fitted(opacity, capture)
     rays = exposed(capture, store, grid, opacity, march, torch.zeros(3))
     again = find_ranges(store, grid, opacity, march, rays.origins, rays.directions)
+    assert rays.ranges is not None
     assert torch.equal(again[0], rays.ranges[0])
     assert torch.equal(again[1], rays.ranges[1])
     frame = grid.frame(*MISSING[opacity])
@@ -181,6 +182,7 @@ def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
         # Empty space far from the surface gets no gradient within a transparency's ranges.
         if opacity == "distance":
             assert (gradients[1] - gradients[0]).norm() < 0.05 * gradients[0].norm()
+    assert rays.ranges is not None
     covered = float((rays.ranges[1][:, 1] - rays.ranges[1][:, 0]).sum()) / len(rays)
     assert covered < 16 * march.step  # and they save something: the ball is 20 voxels thick, the grid 26
 
@@ -226,4 +228,5 @@ def test_no_rays_where_nothing_is() -> None:
     rays = exposed(capture, store[:0], empty, "distance", march, torch.zeros(3))
     assert len(rays) == 0
     assert rays.camera_starts == [0, 0, 0, 0]
+    assert rays.ranges is not None
     assert rays.ranges[0].tolist() == [0]

@@ -72,6 +72,16 @@ def test_higher_degrees(opacity: str, degree: int) -> None:
     assert (result.field.sh[..., 1:, :] != 0).any()
 
 
+@pytest.mark.parametrize("visit", ["cells", "box"])
+def test_what_rays_visit_changes_next_to_nothing(visit: str) -> None:
+    """Without integration ranges, and even through the whole box, the same surface comes out."""
+    result = fit(ball(8, 32), sh_degree=0, levels=1, voxel=0.05, descent={"visit": visit})
+    usual = fit(ball(8, 32), sh_degree=0, levels=1, voxel=0.05)
+    assert np.isnan(result.history[0]["samples"])
+    assert usual.history[0]["samples"] > 0
+    assert abs(np.abs(errors(result.mesh)).mean() - np.abs(errors(usual.mesh)).mean()) < 0.1 * 0.05
+
+
 def test_plates_are_the_background() -> None:
     result = fit(ball(8, 32, plates=True), sh_degree=0, levels=1, voxel=0.05)
     assert np.abs(errors(result.mesh)).max() < 2 * 0.05

@@ -76,7 +76,8 @@ class Saved:
         pixels = arrays["pixels"].split(plain["rays_per_camera"])
         counts = arrays["range_counts"].long()
         offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-        rays = rays_of(capture, grid, list(pixels), (offsets, arrays["ranges"]), settings.descent.bundle)
+        ranges = (offsets, arrays["ranges"]) if settings.descent.visit == "ranges" else None
+        rays = rays_of(capture, grid, list(pixels), ranges, settings.descent.bundle)
         rays.expose(capture, studio.backdrop, studio.exposure)
         adam = begin_adam(store, settings)
         adam.first, adam.second, adam.t = arrays["first"], arrays["second"], plain["t"]
@@ -125,7 +126,7 @@ class Checkpoints:
     ) -> None:
         """Replaces the file."""
         rays, grid = stage.rays, stage.grid
-        offsets, ranges = rays.ranges
+        offsets, ranges = rays.ranges or (torch.zeros(1, dtype=torch.int64), torch.zeros(0, 2))
         plain = {
             "version": VERSION,
             "label": self.label,

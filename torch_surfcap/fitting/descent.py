@@ -39,7 +39,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     frame = grid.frame(*MISSING[settings.opacity])
     arguments: dict[str, Any] = {
         "voxels": store,
-        "table": grid.table,
+        "table": stage.table(settings),
         "frame": frame,
         **{name: getattr(rays, name) for name in RAY_ARGUMENTS},
         **stage.march._asdict(),

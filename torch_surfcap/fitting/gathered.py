@@ -51,6 +51,7 @@ class GatheredGradient:
 
     def lay_out(self) -> None:
         """Rows of slots for all samples within the ranges, whatever the shift."""
+        assert self.rays.ranges is not None  # the settings see to it
         self.starts, self.first = slot_rows(
             self.rays.ranges, self.march.step, self.rays.bundle, len(self.rays)
         )

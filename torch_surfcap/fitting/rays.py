@@ -28,7 +28,8 @@ MARGIN = 4  # voxels beyond the silhouette that rays are followed
 class RayBatch:
     """R rays and their observations, float32, in the order of cameras and pixel blocks.
 
-    origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them;
+    origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them,
+    or None, where rays search for the cells that are not empty;
     camera_starts: [N + 1], where each camera's rays begin; pixels: [R] int32, row-major number in the camera's picture;
     cameras: of the pictures; bundle: consecutive rays that share a list of ranges.
     """
@@ -39,7 +40,7 @@ class RayBatch:
     background: Tensor
     mask: Tensor
     weight: Tensor
-    ranges: tuple[Tensor, Tensor]
+    ranges: tuple[Tensor, Tensor] | None
     camera_starts: list[int]
     pixels: Tensor
     cameras: Cameras
@@ -54,7 +55,9 @@ class RayBatch:
 
     def samples(self, step: float) -> float:
         """How many samples, `step` apart, the integration ranges hold: what one iteration visits, but for what lies behind
-        an opaque surface."""
+        an opaque surface. NaN without ranges."""
+        if self.ranges is None:
+            return math.nan
         offsets, ranges = self.ranges
         rays = torch.full_like(offsets[1:], self.bundle)
         rays[-1:] = len(self) - self.bundle * (len(rays) - 1)
@@ -62,7 +65,9 @@ class RayBatch:
         return float((length * rays.repeat_interleave(offsets.diff())).sum()) / step
 
     def find_ranges(self, store: Tensor, grid: TileGrid, opacity: str, march: March) -> None:
-        """Sets the ranges to those of the field as it now is."""
+        """Sets the ranges, where there are any, to those of the field as it now is."""
+        if self.ranges is None:
+            return
         found = find_ranges(store, grid, opacity, march, self.origins, self.directions)
         self.ranges = shared_ranges(found, self.bundle)
 
@@ -131,15 +136,27 @@ def picture_at(picture: Tensor, pixels: Tensor) -> Tensor:
 
 
 def gather_rays(
-    capture: Capture, store: Tensor, grid: TileGrid, opacity: str, march: March, bundle: int = 1
+    capture: Capture,
+    store: Tensor,
+    grid: TileGrid,
+    opacity: str,
+    march: March,
+    bundle: int = 1,
+    visit: str = "ranges",
 ) -> RayBatch:
-    """The rays of all cameras that meet anything in the field (the others are culled), still without colours.
+    """The rays of all cameras that meet anything in the field (the others are culled), still without colours; all rays
+    where ``visit`` is "box".
 
     The weight of a ray is 1/(number of views * rho), rho = (voxel * focal / distance)^2 being the pixels that a voxel's
     face covers: the gradient on a voxel then depends neither on the number of cameras nor on the image size nor on the
     level.
     """
     assert capture.masks is not None
+    if visit == "box":
+        everywhere = [_blocked(torch.ones_like(mask).nonzero()) for mask in capture.masks]
+        widths = capture.cameras.size[:, 0].tolist()
+        pixels = [(i[:, 0] * w + i[:, 1]).int() for i, w in zip(everywhere, widths, strict=True)]
+        return rays_of(capture, grid, pixels, None)
     per_voxel = pixels_per_voxel(capture, grid)
     store = colorless(store)  # once, not anew for every camera
     chosen, counts, ranges = [], [], []
@@ -158,11 +175,16 @@ def gather_rays(
         counts.append(passes[hit])
         ranges.append(stretches)
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
-    return rays_of(capture, grid, chosen, shared_ranges((offsets, torch.cat(ranges)), bundle), bundle)
+    found = shared_ranges((offsets, torch.cat(ranges)), bundle) if visit == "ranges" else None
+    return rays_of(capture, grid, chosen, found, bundle)
 
 
 def rays_of(
-    capture: Capture, grid: TileGrid, pixels: list[Tensor], ranges: tuple[Tensor, Tensor], bundle: int = 1
+    capture: Capture,
+    grid: TileGrid,
+    pixels: list[Tensor],
+    ranges: tuple[Tensor, Tensor] | None,
+    bundle: int = 1,
 ) -> RayBatch:
     """The rays through pixels, given per camera by their row-major numbers, still without colours."""
     assert capture.masks is not None

@@ -38,6 +38,9 @@ class Descent:
     step: float = 3.0**0.5  # between samples, voxels
     last_step: float = 3.0**0.5  # the same at the finest level
     jitter: float = 1.0  # a ray's lattice is shifted by up to half this many steps, anew in every iteration
+    visit: str = (
+        "ranges"  # of a ray: its integration ranges, all "cells" that are not empty, or the whole "box"
+    )
     bundle: int = 1  # consecutive rays (8 x 8 pixels are 64) that share a list of integration ranges
     stop: float = 1e-3  # a ray ends when its transmittance is lower
 
@@ -62,6 +65,7 @@ CHOICES = {
     "upscale": ("plain", "sqrt"),
 }
 SAMPLE_TARGETS = ("observed", "rendered")
+VISITS = ("ranges", "cells", "box")
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,7 @@ class FitSettings:
                 f"fit: unknown setting {sorted(unknown)[0]!r}, expected one of {', '.join(sorted(known))}"
             )
         settings = FitSettings(**given)
+        visits = VISITS if settings.gradient == "scatter" else VISITS[:1]
         may_halve = settings.storage < 32 and settings.gradient == "scatter"
         for name, sound in (
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
@@ -147,6 +152,7 @@ class FitSettings:
             ("levels", settings.levels is None or settings.levels >= 1),
             *((name, getattr(settings, name) in words) for name, words in CHOICES.items()),
             ("losses.sample_target", settings.losses.sample_target in SAMPLE_TARGETS),
+            ("descent.visit", settings.descent.visit in visits),
             ("gradient", settings.gradient in ("scatter", "gather")),
             ("lattice", settings.lattice in (32, 8)),
         ):

@@ -66,6 +66,10 @@ class Stage:
     compared: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
 
+    def table(self, settings: FitSettings) -> Tensor:
+        """The grid's table, where the whole box is visited without what it says about empty space."""
+        return self.grid.table.clamp(min=ops.OUTSIDE) if settings.descent.visit == "box" else self.grid.table
+
     def decoded(self, opacity: str) -> Tensor:
         """The records in floats."""
         return codes.decode(self.store, *MISSING[opacity])
@@ -87,11 +91,11 @@ def begin_stage(
     settings: FitSettings, plan: list[Level], number: int, grid: TileGrid, store: Tensor, studio: Studio
 ) -> Stage:
     """A level before its first iteration: rays gathered, Adam at rest."""
-    level = plan[number]
+    level, descent = plan[number], settings.descent
     store = codes.encode(store, *MISSING[settings.opacity], settings.storage)
     march = march_of(settings, level, number == len(plan) - 1)
     capture = studio.pictures[level.halvings]
-    rays = gather_rays(capture, store, grid, settings.opacity, march, settings.descent.bundle)
+    rays = gather_rays(capture, store, grid, settings.opacity, march, descent.bundle, descent.visit)
     rays.expose(capture, studio.backdrop, studio.exposure)
     adam = begin_adam(store, settings)
     return Stage(number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations))
