@@ -19,9 +19,9 @@ def test_table() -> None:
     assert markdown([BASE, WORSE, FAILED], COLUMNS, 1000).splitlines() == [
         "|  | settings | Chamfer, mm | PSNR volume, dB | pieces | seconds |",
         "|---|---|---|---|---|---|",
-        "| baseline |  | **1.20** | **30.00** | 1 | 10 |",
+        "| baseline |  | **1.200** | **30.00** | 1 | 10 |",
         "| *terms* |  |  |  |  |  |",
-        "| worse | `x=1` | 1.50 (+0.30) | 28.50 (-1.50) | 7 | 10 |",
+        "| worse | `x=1` | 1.500 (+0.300) | 28.50 (-1.50) | 7 | 10 |",
         "| failed | `y=2`: found a \\| b |  |  |  |  |",
     ]
 

@@ -64,7 +64,7 @@ def markdown(lines: Sequence[Line], columns: Iterable[str], millimetres: float |
     shown = {name: COLUMNS[name] for name in columns if any(name in line.scores for line in lines)}
     for name, column in shown.items():
         if column.length and millimetres:
-            shown[name] = column._replace(title=f"{column.title}, mm", unit=1 / millimetres, form=".2f")
+            shown[name] = column._replace(title=f"{column.title}, mm", unit=1 / millimetres, form=".3f")
     filled = [_cells(name, column, lines) for name, column in shown.items()]
     text = [
         _row("", "settings", *(column.title for column in shown.values())),
