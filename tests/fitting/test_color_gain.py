@@ -115,12 +115,6 @@ def test_a_ball_in_different_light(plates: bool) -> None:
     assert result.history[-1]["photo"] < 0.5 * plain.history[-1]["photo"]
 
 
-def test_gains_come_with_plates() -> None:
-    quick: dict[str, Any] = {"sh_degree": 0, "levels": 1, "voxel": 1 / 20}
-    assert fit(ball(6, 32, plates=True), **quick).gains
-    assert not fit(ball(6, 32), **quick).gains
-
-
 def test_a_camera_that_shows_something_else() -> None:
     """Its exposure is held to twice or half the others', which stay as they are."""
     field = torch.rand(3, 5000, 3)

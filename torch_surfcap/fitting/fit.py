@@ -188,7 +188,7 @@ def _chosen(
         "gains": {
             "value": "on" if studio.gains else "off",
             "spread": studio.exposure.spread(),
-            "reason": "given" if s.gains != "auto" else "plates" if studio.gains else "no plates",
+            "reason": "default" if s.gains == "auto" else "given",
             "cameras": {
                 name: {"gain": gain.tolist(), "bias": bias.tolist()}
                 for name, gain, bias in zip(

@@ -77,9 +77,9 @@ class FitSettings:
     voxel:     edge of the finest voxels, world units; a pixel's footprint by default
     levels:    number of resolutions; by default as many, up to 4, as the pictures can be halved
     box:       (x0, y0, z0, x1, y1, z1) around the subject; found by default
-    gains:     "auto", "on", "off": gain and bias per camera; auto: where there are plates, as on a rig of real
-               cameras. View-dependent colours (sh_degree > 0) take a part of what are gains: their values are then
-               less true, the pictures are not
+    gains:     "auto", "on", "off": gain and bias per camera; auto is on: it costs 0.1 dB where cameras are equal, and
+               brings far more where they are not. View-dependent colours (sh_degree > 0) take a part of what are gains:
+               their values are then less true, the pictures are not
     gain_per:  "channel" or "camera", what has a gain and bias of its own
     start:     "hull": the first field falls off at the hull's surface; "constant": a transparency is the same fog inside
     upscale:   "plain" or "sqrt": a transparency at a change of level stays, or becomes its root, so that two fine voxels

@@ -109,7 +109,7 @@ def open_studio(capture: Capture, settings: FitSettings, halvings: int) -> Studi
     generator = torch.Generator().manual_seed(settings.seed)
     equal = Exposure.equal(len(capture))
     per_channel = settings.gain_per == "channel"
-    gains = settings.gains == "on" or (settings.gains == "auto" and capture.plates is not None)
+    gains = settings.gains != "off"
     return Studio(pictures, choose_backdrop(capture), equal, gains, per_channel, generator)
 
 
