@@ -12,12 +12,19 @@ from torch_surfcap.data.parse import read_json
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
 
+FILES = ("config.yaml", "field.npz", "mesh.ply")  # without which a run can be neither scored nor shown
+
+
+def check_run(run: Path) -> None:
+    """Raises InputError naming the file that a finished run lacks."""
+    for name in FILES:
+        if not (run / name).is_file():
+            raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
+
 
 def read_run(run: Path) -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]:
     """Config, field and mesh of a finished run. Raises InputError naming the file that is missing or damaged."""
-    for name in ("config.yaml", "field.npz", "mesh.ply"):
-        if not (run / name).is_file():
-            raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
+    check_run(run)
     config = settings.load(run / "config.yaml")
     return config, SurfaceField.load(run / "field.npz"), read_mesh(run / "mesh.ply")
 

@@ -36,10 +36,9 @@ from torch_surfcap.data.parse import read_json
 from torch_surfcap.errors import InputError
 from torch_surfcap.metrics import surface_scores
 from torch_surfcap.protocols import dtu, table
-from torch_surfcap.run import gains_fitted, read_run
+from torch_surfcap.run import check_run, gains_fitted, read_run
 
 ERROR_VIEWS = 4
-FILES = ("config.yaml", "field.npz", "mesh.ply")  # of a finished run, without which it cannot be scored
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -85,9 +84,7 @@ def _check(options: argparse.Namespace, runs: list[Path]) -> None:
     if options.table is not None and Path(options.table).suffix != ".md":
         raise InputError(f"--table {options.table}: expected a name in .md, the same in .json goes beside it")
     for run in runs:
-        for name in FILES:
-            if not (run / name).is_file():
-                raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
+        check_run(run)
 
 
 def _score(run: Path, scan: dtu.Scan | None, options: argparse.Namespace) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import trimesh
 
 from tests.data.rigs import write_picture
 from tests.protocols import layouts
+from torch_surfcap.run import FILES
 from torch_surfcap.surface.render import volume
 from train import evaluate
 
@@ -100,7 +101,7 @@ def test_nerf_without_metrics_shows_none(
 ) -> None:
     run = tmp_path / "run"
     run.mkdir()
-    for name in evaluate.FILES:
+    for name in FILES:
         (run / name).write_bytes((nerf / "out" / "chair" / name).read_bytes())
     assert command("--run", run, "--protocol", "nerf", "--table", tmp_path / "nerf.md") == 0
     assert json.loads((tmp_path / "nerf.json").read_text())["mean"]["seconds"] is None

@@ -51,11 +51,13 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     }
     gathered = GatheredGradient(rays, grid, settings, stage.march) if settings.gradient == "gather" else None
     gradients = None if gathered else partial_gradients(store, settings.accumulator)
+    samples = rays.samples(stage.march.step)
     watch = Stopwatch(stage.seconds)
     while not rule.ended:
         if stage.moved >= REFRESH:
             stage.moved = 0.0
             rays.find_ranges(store, grid, settings.opacity, stage.march)
+            samples = rays.samples(stage.march.step)
             if gathered:
                 gathered.lay_out()
             watch.lap("ranges")
@@ -87,6 +89,11 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
             watch.lap("gains")
         losses = torch.cat([ray_losses, voxel_losses])
         weights = losses.new_tensor([*ray_weights, *voxel_weights])
-        row = {"iteration": float(rule.count), "loss": float(losses @ weights), "rate": rule.scale}
+        row = {
+            "samples": samples,
+            "iteration": float(rule.count),
+            "loss": float(losses @ weights),
+            "rate": rule.scale,
+        }
         rule.goes_on(row["loss"])
         yield row | dict(zip(RAY_LOSSES + VOXEL_LOSSES, losses.tolist(), strict=True)) | cosines

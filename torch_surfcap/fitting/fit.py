@@ -121,8 +121,7 @@ def fit(
 
     while True:
         for row in descend(stage, studio, s):
-            count = {"level": float(stage.number), "samples": stage.rays.samples(stage.march.step)}
-            so_far.history.append(count | row)
+            so_far.history.append({"level": float(stage.number)} | row)
             report(Progress(stage.number, len(plan), stage.level, len(stage.store) * ops.TILE**3, row))
             if checkpoints is not None and checkpoints.due():
                 checkpoints.save(s, capture, box, stage, studio, so_far)
