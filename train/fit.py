@@ -142,7 +142,7 @@ def _check_out(out: Path, config: Config) -> None:
         what = "a checkpoint" if found == [CHECKPOINT] else "the results"
         raise InputError(f"out: {out} holds {what} of an earlier run ({found[0]}), {expected}")
     if config.resume:
-        saved = Checkpoints(out / CHECKPOINT, resume=True).load()
+        saved = Checkpoints(out / CHECKPOINT, resume=True).load(arrays=False)
         if saved is not None:
             earlier = settings.of_yaml(saved.label, str(out / CHECKPOINT))
             _check_same(out / CHECKPOINT, earlier, config)

@@ -163,8 +163,9 @@ class Checkpoints:
             np.savez(file, **data)
         self.last = time.monotonic()
 
-    def load(self) -> Saved | None:
-        """The checkpoint to begin with; None where there is none, or none is wanted.
+    def load(self, arrays: bool = True) -> Saved | None:
+        """The checkpoint to begin with; None where there is none, or none is wanted. Without ``arrays`` only what it says
+        of itself is read.
 
         Raises InputError for a file that is no checkpoint or another version's.
         """
@@ -172,15 +173,15 @@ class Checkpoints:
             return None
         try:
             with np.load(self.path, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in data.files}
-            plain = json.loads(bytes(arrays.pop("plain")).decode())
+                plain = json.loads(bytes(data["plain"]).decode())
+                found = {name: data[name] for name in data.files if arrays and name != "plain"}
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{self.path}: a damaged checkpoint ({error}), expected one of a fit") from error
         if plain["version"] != VERSION:
             raise InputError(
                 f"{self.path}: written by version {plain['version']}, expected {VERSION}, this one's"
             )
-        return Saved(arrays, plain)
+        return Saved(found, plain)
 
     def check(self, saved: Saved, settings: FitSettings, capture: Capture) -> None:
         """Raises InputError where a checkpoint is of other settings or other cameras."""
