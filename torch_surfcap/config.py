@@ -87,7 +87,7 @@ class CamerasConfig:
 
 @dataclass
 class MeshConfig:
-    threshold: float | None = None  # opacity value of the surface; auto: 0.81 transparency, 0 distance
+    threshold: float | None = None  # opacity value of the surface; auto: the field's level
     smooth: int | None = _within(None, 0)  # rounds of Taubin smoothing
     specks: float | None = _within(None, 0, 1)  # pieces under this fraction of the largest area go
 

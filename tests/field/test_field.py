@@ -161,6 +161,28 @@ def test_what_is_no_field_is_refused(tmp_path: Path) -> None:
             SurfaceField.load(tmp_path / name)
 
 
+def test_values_of_shorter_steps_have_a_higher_level_and_are_rendered_with_them(tmp_path: Path) -> None:
+    """One cube of matter: its transparencies of a path and, as their roots, of half the path give the same mesh and,
+    where they are constant, the same light."""
+    value = torch.full((12, 12, 12), 0.6)
+    value[:2] = value[-2:] = value[:, :2] = value[:, -2:] = value[..., :2] = value[..., -2:] = 1.0
+    grey = torch.full((12, 12, 12, 3), 0.5)
+    long = SurfaceField.from_dense(value, grey, [0.0, 0.0, 0.0], 1.0)
+    half = SurfaceField.from_dense(value.sqrt(), grey, [0.0, 0.0, 0.0], 1.0)
+    half = SurfaceField(half.voxels, half.grid, half.opacity, step=long.step / 2)
+    assert (long.level, half.level) == (0.81, pytest.approx(0.9))
+    origins = torch.tensor([[5.0, 5.0, -20.0]])
+    directions = torch.tensor([[0.0, 0.0, 1.0]])
+    light = [field(origins, directions).transmittance.item() for field in (long, half)]
+    assert light[1] == pytest.approx(light[0], rel=0.2)  # the ends of the path fall differently between samples
+    assert half(origins, directions, step=long.step).transmittance.item() > 2 * light[0]
+    half.save(tmp_path / "field.npz")
+    loaded = SurfaceField.load(tmp_path / "field.npz")
+    assert (loaded.step, loaded.level) == (half.step, half.level)
+    a, b = (field.extract_mesh() for field in (long, half))
+    assert abs(b.volume / a.volume - 1) < 0.03
+
+
 def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="sh: expected"):
         SurfaceField.from_dense(torch.ones(4, 4, 4), torch.ones(4, 4, 5, 1, 3), [0, 0, 0], 1.0)
@@ -169,6 +191,8 @@ def test_wrong_arguments_are_named() -> None:
         SurfaceField(field.voxels, field.grid, "alpha")
     with pytest.raises(ValueError, match="voxels: expected"):
         SurfaceField(field.voxels[1:], field.grid)
+    with pytest.raises(ValueError, match="step: expected a positive number"):
+        SurfaceField(field.voxels, field.grid, step=0.0)
 
 
 def test_dense_reference_holds_the_same_values() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import zipfile
 import zlib
@@ -24,9 +23,10 @@ if TYPE_CHECKING:
 ETA = 0.01  # transparency of the solid
 CLAMP = 4.0  # voxels; a signed distance is known in this band and constant beyond it
 SLOPE = 4.0  # per voxel, of the signed distance's logistic
-LEVEL = {"transparency": 0.81, "distance": 0.0}  # value on the surface
+LEVEL = {"transparency": 0.81, "distance": 0.0}  # value on the surface, of a path of a voxel's diagonal
+DIAGONAL = 3.0**0.5  # of a voxel, in voxels
 MISSING = {"transparency": (1.0, ETA), "distance": (CLAMP, -CLAMP)}  # value outside, inside
-FORMAT = 1  # of the .npz file
+FORMAT = 2  # of the .npz file
 
 
 class RayOutput(NamedTuple):
@@ -45,6 +45,8 @@ class SurfaceField(nn.Module):
         grid: which tiles there are. table: its table (a buffer). tile_coords: [T, 3] int32, relative to ``origin``.
         opacity: "transparency" (1 = empty) or "distance" (signed, in voxels, positive outside).
         sh_degree: 0, 1 or 2.
+        step: voxels between the samples of a ray: a transparency is that of a path of this length.
+        level: opacity value on the surface. A path of a voxel's diagonal has transparency 0.81 there, shorter ones more.
 
     >>> grid = torch.ones(8, 8, 8); grid[2:6, 2:6, 2:6] = 0.01
     >>> field = SurfaceField.from_dense(grid, torch.full((8, 8, 8, 1, 3), 0.5), [0.0, 0.0, 0.0], 1.0)
@@ -53,8 +55,12 @@ class SurfaceField(nn.Module):
     0.5
     """
 
-    def __init__(self, voxels: Tensor, grid: TileGrid, opacity: str = "transparency") -> None:
+    def __init__(
+        self, voxels: Tensor, grid: TileGrid, opacity: str = "transparency", step: float = DIAGONAL
+    ) -> None:
         super().__init__()
+        if not 0 < step < float("inf"):
+            raise ValueError(f"step: expected a positive number of voxels, got {step:g}")
         if opacity not in LEVEL:
             raise ValueError(f"opacity: expected transparency or distance, got {opacity!r}")
         expected = (len(grid.coords), ops.TILE, ops.TILE, ops.TILE)
@@ -68,7 +74,8 @@ class SurfaceField(nn.Module):
         self.opacity = opacity
         self.voxel_size = grid.voxel_size
         self.outside, self.inside = MISSING[opacity]
-        self.level = LEVEL[opacity]
+        self.step = step
+        self.level = LEVEL[opacity] ** (step / DIAGONAL)  # a path's transparency is a power of its length
         self.table: Tensor
         self.tile_coords: Tensor
         self.origin: Tensor
@@ -134,9 +141,9 @@ class SurfaceField(nn.Module):
         return self.voxels[..., 1:].unflatten(-1, ((self.sh_degree + 1) ** 2, 3))
 
     def march(self, step: float | None = None, stop: float | None = None) -> March:
-        """How rays are sampled: a voxel's diagonal apart; single precision stops at a transmittance of 1e-4."""
+        """How rays are sampled, ``step`` in world units; single precision stops at a transmittance of 1e-4."""
         if step is None:
-            step = math.sqrt(3.0) * self.voxel_size
+            step = self.step * self.voxel_size
         if stop is None:
             stop = 0.0 if self.voxels.dtype == torch.float64 else 1e-4
         return March(ops.OPACITY[self.opacity], SLOPE, step, stop)
@@ -153,7 +160,8 @@ class SurfaceField(nn.Module):
 
         Args:
             origins, directions: [R, 3], world; directions are unit vectors. background: [R, 3], black by default.
-            shift: [R] displacement of a ray's samples in steps. step: between samples, world units; a voxel's diagonal.
+            shift: [R] displacement of a ray's samples in steps. step: between samples, world units; the field's own by
+                default.
 
         Differentiability: voxels and background.
         """
@@ -209,7 +217,7 @@ class SurfaceField(nn.Module):
         """The surface by marching cubes, with vertex colours, in world units, normals outward.
 
         Args:
-            threshold: value on the surface; 0.81 for a transparency, 0 for a signed distance by default.
+            threshold: value on the surface; the field's level by default.
             smooth: rounds of Taubin smoothing. specks: pieces under this fraction of the largest one's area are removed.
         """
         from torch_surfcap.surface.extract import extract_mesh
@@ -226,6 +234,7 @@ class SurfaceField(nn.Module):
             "origin": np.array(self._corner),
             "voxel_size": np.float64(self.voxel_size),
             "opacity": np.str_(self.opacity),
+            "step": np.float64(self.step),
         }
         with atomic_write(path) as partial, open(partial, "wb") as file:
             np.savez(file, **data)
@@ -241,7 +250,7 @@ class SurfaceField(nn.Module):
                 x, y, z = (float(c) for c in data["origin"])
                 table, coords = torch.from_numpy(data["table"]), torch.from_numpy(data["tile_coords"])
                 grid = TileGrid(with_skips(table), coords, (x, y, z), float(data["voxel_size"]))
-                return cls(torch.from_numpy(data["voxels"]), grid, str(data["opacity"]))
+                return cls(torch.from_numpy(data["voxels"]), grid, str(data["opacity"]), float(data["step"]))
         except InputError:
             raise
         except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:

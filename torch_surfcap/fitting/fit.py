@@ -136,7 +136,8 @@ def fit(
         if checkpoints is not None:
             checkpoints.save(s, capture, box, stage, studio, so_far)
     watch.lap("fit")
-    surface = SurfaceField(stage.decoded(s.opacity), stage.grid, s.opacity)
+    step = stage.march.step / stage.grid.voxel_size
+    surface = SurfaceField(stage.decoded(s.opacity), stage.grid, s.opacity, step)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:

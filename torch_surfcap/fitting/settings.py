@@ -47,16 +47,19 @@ class Descent:
 
 LOSSES = {
     "distance": Losses(),
-    "transparency": Losses(sample=1.0, tv_opacity=2e-4, ballooning=2e-5, curvature=0.0),
+    "transparency": Losses(sample=0.5, tv_opacity=4e-5, tv_color=1e-4, curvature=1e-3),
 }
 # Weight of the mask loss. Silhouettes that were found by plates err where subject and room look alike, and with plates
 # the colours themselves say what is empty.
-MASK = {"distance": 0.3, "transparency": 0.1}
+MASK = {"distance": 0.3, "transparency": 0.05}
 MASK_BY_PLATES = 0.03
 DESCENT = {
     "distance": Descent(),
-    "transparency": Descent(rate_opacity=0.06),
+    # Shorter steps give a transparency a sharper surface, which holds on to concave parts.
+    "transparency": Descent(rate_opacity=0.12, last_step=1.0),
 }
+# Rounds of Taubin smoothing: a transparency falls within a voxel, so that its surface is a staircase.
+SMOOTH = {"distance": 5, "transparency": 120}
 
 CHOICES = {
     "gains": ("auto", "on", "off"),
@@ -87,8 +90,9 @@ class FitSettings:
     gradient:  "scatter", the exact gradient of the ray terms, or "gather", the paper's eq. 19: close to it, and without
                sums that threads share
     lattice:   32 or 8, bits of a number of the samples' gradients that "gather" keeps
-    threshold: opacity value of the surface. smooth: rounds of Taubin smoothing of the mesh. specks: pieces under this
-               fraction of the largest one's area are removed
+    threshold: opacity value of the surface, by default the field's level. specks: pieces under this fraction of the
+               largest one's area are removed
+    smooth:    rounds of Taubin smoothing of the mesh, by default what suits the opacity
     storage:   bits of a coefficient during the fit, 32, 16 or 8, and of each of its moments
     rounding:  of narrow coefficients, "stochastic" or "nearest"
     accumulator: bits of the gradients' sums; 32, or 16 where storage is less than 32 and the gradient is scattered
@@ -109,7 +113,7 @@ class FitSettings:
     gradient: str = "scatter"
     lattice: int = 32
     threshold: float | None = None
-    smooth: int = 5
+    smooth: int = SMOOTH["distance"]
     specks: float = 0.01
     storage: int = 32
     rounding: str = "stochastic"
@@ -134,6 +138,7 @@ class FitSettings:
             value = given.get(name, {})
             if isinstance(value, dict):
                 given[name] = replace(defaults, **{k: v for k, v in value.items() if v is not None})
+        given.setdefault("smooth", SMOOTH[opacity])
         known = {f.name for f in fields(FitSettings)}
         unknown = set(given) - known
         if unknown:

@@ -38,8 +38,7 @@ def extract_mesh(
 
     Args:
         field: the field.
-        threshold: value of the surface; matter is where the value is smaller. None: the field's own level (0.81 for
-            a transparency, 0 for a distance).
+        threshold: value of the surface; matter is where the value is smaller. None: the field's own level.
         smooth: rounds of Taubin smoothing (trimesh's: every other round shrinks, the rounds between swell).
         specks: least area of a piece, as a share of the largest one's; 0 keeps everything.
         cavities: keep large inner sheets.

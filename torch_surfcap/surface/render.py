@@ -139,14 +139,14 @@ def volume(field: SurfaceField, cameras: Cameras, i: int, background: Background
 
 def constant_part(field: SurfaceField) -> SurfaceField:
     """The field with its constant colour β_00 alone: what does not depend on the direction of view."""
-    return type(field)(field.voxels.detach()[..., :4], field.grid, field.opacity)
+    return type(field)(field.voxels.detach()[..., :4], field.grid, field.opacity, field.step)
 
 
 def view_dependent_part(field: SurfaceField) -> SurfaceField:
     """The field with mid grey in place of β_00: what depends on the direction of view, brighter or darker than that."""
     voxels = field.voxels.detach().clone()
     voxels[..., 1:4] = MID_GREY
-    return type(field)(voxels, field.grid, field.opacity)
+    return type(field)(voxels, field.grid, field.opacity, field.step)
 
 
 def field_box(field: SurfaceField) -> tuple[Tensor, Tensor]:
