@@ -174,7 +174,9 @@ def test_values_of_shorter_steps_have_a_higher_level_and_are_rendered_with_them(
     origins = torch.tensor([[5.0, 5.0, -20.0]])
     directions = torch.tensor([[0.0, 0.0, 1.0]])
     light = [field(origins, directions).transmittance.item() for field in (long, half)]
-    assert light[1] == pytest.approx(light[0], rel=0.2)  # the ends of the path fall differently between samples
+    assert light[1] == pytest.approx(
+        light[0], rel=0.2
+    )  # the ends of the path fall differently between samples
     assert half(origins, directions, step=long.step).transmittance.item() > 2 * light[0]
     half.save(tmp_path / "field.npz")
     loaded = SurfaceField.load(tmp_path / "field.npz")
