@@ -6,6 +6,8 @@ import operator
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+from torch_surfcap.field.field import DIAGONAL
+
 
 @dataclass(frozen=True)
 class Losses:
@@ -35,8 +37,8 @@ class Descent:
     rate_opacity: float = 0.1  # of the opacity value, per iteration
     rate_color: float = 0.06  # of the constant colour
     rate_view: float = 0.02  # of the view-dependent coefficients
-    step: float = 3.0**0.5  # between samples, voxels
-    last_step: float = 3.0**0.5  # the same at the finest level
+    step: float = DIAGONAL  # between samples, voxels
+    last_step: float = DIAGONAL  # the same at the finest level
     jitter: float = 1.0  # a ray's lattice is shifted by up to half this many steps, anew in every iteration
     visit: str = (
         "ranges"  # of a ray: its integration ranges, all "cells" that are not empty, or the whole "box"
