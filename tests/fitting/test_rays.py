@@ -15,9 +15,9 @@ from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.levels import first_field
 from torch_surfcap.fitting.rays import (
     BLOCK,
+    RangeFinder,
     RayBatch,
     choose_backdrop,
-    find_ranges,
     gather_rays,
     shared_ranges,
 )
@@ -162,7 +162,7 @@ def test_ranges_hold_all_samples_with_weight(opacity: str) -> None:
     capture = ball()
     grid, store, march = fitted(opacity, capture)
     rays = exposed(capture, store, grid, opacity, march, torch.zeros(3))
-    again = find_ranges(store, grid, opacity, march, rays.origins, rays.directions)
+    again = RangeFinder(store, grid, opacity, march).ranges(rays.origins, rays.directions)
     assert rays.ranges is not None
     assert torch.equal(again[0], rays.ranges[0])
     assert torch.equal(again[1], rays.ranges[1])

@@ -89,6 +89,13 @@ class TileGrid:
     def to(self, device: torch.device | str) -> TileGrid:
         return TileGrid(self.table.to(device), self.coords.to(device), self.origin, self.voxel_size)
 
+    def without(self, tiles: Tensor) -> Tensor:
+        """The table with some stored tiles, [T] bool, as outside: what a march that shall not see them reads."""
+        x, y, z = self.places[tiles].long().unbind(1)
+        table = self.table.clone()
+        table[x, y, z] = OUTSIDE
+        return with_skips(table)
+
     def borders(self, within: Tensor) -> Tensor:
         """Which stored voxels have one of their 6 neighbours on the other side: bool [T, 4, 4, 4].
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_surfcap import ops
+from torch_surfcap import codes, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.arrays import float_tensor
 from torch_surfcap.data.cameras import Cameras
@@ -68,7 +68,7 @@ class RayBatch:
         """Sets the ranges, where there are any, to those of the field as it now is."""
         if self.ranges is None:
             return
-        found = find_ranges(store, grid, opacity, march, self.origins, self.directions)
+        found = RangeFinder(store, grid, opacity, march).ranges(self.origins, self.directions)
         self.ranges = shared_ranges(found, self.bundle)
 
     def expose(self, capture: Capture, backdrop: Tensor | None, exposure: Exposure) -> None:
@@ -158,19 +158,18 @@ def gather_rays(
         pixels = [(i[:, 0] * w + i[:, 1]).int() for i, w in zip(everywhere, widths, strict=True)]
         return rays_of(capture, grid, pixels, None)
     per_voxel = pixels_per_voxel(capture, grid)
-    store = colorless(store)  # once, not anew for every camera
+    finder = RangeFinder(store, grid, opacity, march)
     chosen, counts, ranges = [], [], []
     for i, mask in enumerate(capture.masks):
         reach = int(torch.ceil(MARGIN * per_voxel[i])) + 1
         index = _blocked((grown(mask, reach) > 0).nonzero())
         origins, directions = _rays(capture, i, index)
-        offsets, stretches = find_ranges(store, grid, opacity, march, origins, directions)
+        offsets, stretches = finder.ranges(origins, directions)
         passes = offsets.diff()
         hit = passes > 0
         # Rays through tiles that are empty as yet stay too: they would object if the surface grew there.
         rest = (~hit).nonzero()[:, 0]
-        all_of_them, _ = find_ranges(store, grid, opacity, march, origins[rest], directions[rest], math.inf)
-        hit[rest] = all_of_them.diff() > 0
+        hit[rest] = finder.meets_tiles(origins[rest], directions[rest])
         chosen.append((index[hit, 0] * mask.shape[1] + index[hit, 1]).int())
         counts.append(passes[hit])
         ranges.append(stretches)
@@ -218,27 +217,37 @@ def _rays(capture: Capture, i: int, index: Tensor) -> tuple[Tensor, Tensor]:
     return origins.float().contiguous(), directions.float().contiguous()
 
 
-def colorless(store: Tensor) -> Tensor:
-    """The field with as little colour as a record can have: a search for its surface walks through less memory."""
-    return store[..., : ops.pitch(0)].contiguous()
+class RangeFinder:
+    """Finds the integration ranges of rays, see ``ops.integration_ranges``, in a field as it now is."""
 
+    def __init__(self, store: Tensor, grid: TileGrid, opacity: str, march: March) -> None:
+        missing = MISSING[opacity]
+        # With as little colour as a record can have, the search walks through less memory.
+        self.store = codes.decode(store[..., : ops.pitch(0)].contiguous(), *missing)
+        self.frame, self.march, self.quiet, self.table = (
+            grid.frame(*missing),
+            march,
+            QUIET[opacity],
+            grid.table,
+        )
+        # Tiles without a value under `quiet` are crossed as if they were missing.
+        self.busy_table = grid.without((self.store[..., 0] >= self.quiet).flatten(1).all(1))
 
-def find_ranges(
-    store: Tensor,
-    grid: TileGrid,
-    opacity: str,
-    march: March,
-    origins: Tensor,
-    directions: Tensor,
-    quiet: float | None = None,
-) -> tuple[Tensor, Tensor]:
-    """The integration ranges of rays in the field as it now is, see ``ops.integration_ranges``; ``quiet`` is by default what
-    suits the opacity."""
-    frame, shift = grid.frame(*MISSING[opacity]), origins.new_zeros(len(origins))
-    level = QUIET[opacity] if quiet is None else quiet
-    return ops.integration_ranges(
-        colorless(store), grid.table, frame, origins, directions, shift, *march, level
-    )
+    def ranges(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """What is not as good as empty along rays [R, 3]."""
+        return self._search(self.busy_table, self.quiet, origins, directions)
+
+    def meets_tiles(self, origins: Tensor, directions: Tensor) -> Tensor:
+        """[R] bool: which rays come by any tile, were it empty."""
+        return self._search(self.table, math.inf, origins, directions)[0].diff() > 0
+
+    def _search(
+        self, table: Tensor, quiet: float, origins: Tensor, directions: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        shift = origins.new_zeros(len(origins))
+        return ops.integration_ranges(
+            self.store, table, self.frame, origins, directions, shift, *self.march, quiet
+        )
 
 
 def _blocked(index: Tensor) -> Tensor:
