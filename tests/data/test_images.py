@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.data.images import shrink, undistort
-from torch_surfcap.data.silhouettes import black_silhouette, cut_back
+from torch_surfcap.data.silhouettes import black_silhouette, fit_to_background
 from torch_surfcap.errors import InputError
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.01)
@@ -112,22 +112,25 @@ def test_unwritable_folders_are_named(tmp_path: Path) -> None:
         pass
 
 
-def test_wide_masks_are_cut_back_to_the_subject() -> None:
-    x, y = np.meshgrid(np.arange(80), np.arange(60))
-    subject = ((x - 40) ** 2 + (y - 30) ** 2 < 20**2) | (
-        (np.abs(y - 30) < 1) & (x > 40) & (x < 70)
-    )  # and a thin rod
+def test_masks_are_corrected_by_a_background_of_one_colour() -> None:
+    x, y = np.meshgrid(np.arange(160), np.arange(160))
+    disk, rod = (x - 80) ** 2 + (y - 80) ** 2 < 30**2, (np.abs(y - 80) < 2) & (x > 80) & (x < 140)
+    subject = disk | rod
     picture = np.where(subject[..., None], (0.5, 0.2, 0.1), (1.0, 1.0, 1.0)).astype(np.float32)
-    picture[10:20, 36:44] = 1.0  # a white place at the subject's border
+    picture[50:60, 76:84] = 1.0  # a white place at the subject's border
     true = subject.astype(np.float32)
     for wide in (1, 5):
-        mask = cv2.dilate(true, np.ones((2 * wide + 1, 2 * wide + 1), np.uint8))
-        (cut,), pixels = cut_back([picture], [mask])
-        assert pixels == wide
+        ring = np.ones((2 * wide + 1, 2 * wide + 1), np.uint8)
+        (cut,), pixels = fit_to_background([picture], [cv2.dilate(true, ring)])
+        assert pixels == -wide
         assert cut[~subject].sum() == 0
-        assert cut[subject].mean() > 0.97  # but for the white place's own border
-        assert cut[30, 41:70].all()
-    (same,), pixels = cut_back([picture], [true])
+        assert cut[subject].mean() > 0.97  # but for the white place
+        assert cut[rod].all()
+        (grown,), pixels = fit_to_background([picture], [cv2.erode(true, ring)])
+        assert pixels == wide
+        assert grown[~subject].sum() == 0
+        assert grown[disk].mean() > 0.97
+    (same,), pixels = fit_to_background([picture], [true])
     assert pixels == 0
     assert np.array_equal(same, true)
 
@@ -141,6 +144,6 @@ def test_masks_that_cannot_be_judged_stay(behind: str) -> None:
         picture = np.random.default_rng(0).random((90, 90, 3), dtype=np.float32)
     if behind == "nothing":
         mask[:] = 1.0
-    (same,), pixels = cut_back([picture], [mask])
+    (same,), pixels = fit_to_background([picture], [mask])
     assert pixels == 0
     assert np.array_equal(same, mask)

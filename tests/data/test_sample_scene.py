@@ -11,7 +11,7 @@ import trimesh
 
 from torch_surfcap.data.capture import load_capture
 from torch_surfcap.data.plates import separate
-from torch_surfcap.data.sample_scene import main, make_sample_scene
+from torch_surfcap.data.sample_scene import Coat, main, make_sample_scene
 from torch_surfcap.errors import InputError
 
 
@@ -53,6 +53,24 @@ def test_the_surface_projects_into_the_masks(folder: Path) -> None:
         assert (mask[row, column] > 0).float().mean() > 0.97  # slivers fall between the rays
         inside = mask > 0.99
         assert drawn[inside].mean() > 0.99
+
+
+def test_a_coat_adds_highlights_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+    matte = load_capture(folder)
+    assert matte.masks is not None
+    lit = {}
+    for roughness in (0.3, 0.6):
+        glossy = load_capture(make_sample_scene(tmp_path / "gloss", 3, 1, 192, coat=Coat(1.5, roughness)))
+        assert glossy.masks is not None
+        more = glossy.photograph(0) - matte.photograph(0)
+        assert torch.equal(glossy.masks[0], matte.masks[0])
+        assert (more[matte.masks[0] == 0] == 0).all()
+        assert more.min() > -0.01
+        assert more.max() > 0.1
+        lit[roughness] = float((more > 0.02).float().mean())
+    assert 0 < lit[0.3] < 0.7 * lit[0.6]  # the rougher, the wider
+    with pytest.raises(InputError, match="roughness 0"):
+        Coat(0.5, 0.0)
 
 
 def test_plates_show_the_room_without_the_figure(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Silhouettes for captures that have none yet or too wide ones, and the cameras that are of no use to a fit."""
+"""Silhouettes for captures that have none yet or wrong ones, and the cameras that are of no use to a fit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_surfcap.data.load import in_threads
 from torch_surfcap.data.plates import separate
-from torch_surfcap.data.silhouettes import black_silhouette, cut_back
+from torch_surfcap.data.silhouettes import black_silhouette, fit_to_background
 from torch_surfcap.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,8 +56,8 @@ def _leave_out(capture: Capture, faults: dict[int, str]) -> Capture:
 
 
 def _find_masks(capture: Capture, shadows: bool = True) -> Capture:
-    """A copy with masks: found by plates, or by a black background, where the capture has none; given ones are cut back
-    where they include a background of one colour.
+    """A copy with masks: found by plates, or by a black background, where the capture has none; given ones are
+    corrected where a background of one colour shows that they are too wide or too narrow.
 
     With `shadows` plates that were needed for it become the room in the subject's shadow.
     """
@@ -65,10 +65,11 @@ def _find_masks(capture: Capture, shadows: bool = True) -> Capture:
     photographs = [image.numpy() for image in capture.images]
     if capture.masks is not None:
         if capture.plates is None:  # else these show where the subject is
-            masks, pixels = cut_back(photographs, [mask.numpy() for mask in capture.masks])
+            masks, pixels = fit_to_background(photographs, [mask.numpy() for mask in capture.masks])
             if pixels:
+                what = "cut a part of the subject off" if pixels > 0 else "include the background"
                 found.masks = [torch.from_numpy(mask) for mask in masks]
-                found.warnings.append(f"masks: include the background, cut back by up to {pixels} pixels")
+                found.warnings.append(f"masks: {what}, corrected by up to {abs(pixels)} pixels")
         return found
     if capture.plates is not None:
         plates = [plate.numpy() for plate in capture.plates]

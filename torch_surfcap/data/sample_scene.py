@@ -1,6 +1,7 @@
 """A scene to try everything on: a textured figure of known surface in a textured room.
 
     python -m torch_surfcap.data.sample_scene OUT [--views 24] [--test-views 4] [--size 256] [--seed 0]
+                                              [--gloss 0.5] [--roughness 0.5]
 
 Writes a nerfstudio-style capture: transforms_train.json, transforms_test.json, the photographs in train/ and test/,
 masks in mask/, pictures of the empty room in background/, and the true surface gt.ply (metres). A folder that already
@@ -13,6 +14,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,16 +48,38 @@ AMBIENT = 0.35
 SUPERSAMPLES = 2  # per pixel and axis
 
 
+@dataclass(frozen=True)
+class Coat:
+    """What lies over the figure's matte colours: white highlights of the lamps, of this strength (0: none), by Blinn and
+    Phong with the exponent 2/roughness^4 - 2."""
+
+    gloss: float = 0.0
+    roughness: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.gloss <= 10 and 0.05 <= self.roughness <= 1):
+            raise InputError(
+                f"coat: found gloss {self.gloss} and roughness {self.roughness}, expected 0 to 10 and 0.05 to 1"
+            )
+
+
 def make_sample_scene(
-    folder: str | Path, views: int = 24, test_views: int = 4, size: int = 256, seed: int = 0
+    folder: str | Path,
+    views: int = 24,
+    test_views: int = 4,
+    size: int = 256,
+    seed: int = 0,
+    coat: Coat | None = None,
 ) -> Path:
     """Write the sample scene into `folder` and return it.
 
     views, test_views: cameras around the figure for training and held out; size: of the square pictures, pixels;
-    seed: of textures and camera positions. Raises InputError where the folder cannot be written to.
+    seed: of textures and camera positions; coat: by default none. Raises InputError where the folder cannot be written to.
     """
     folder = Path(folder)
+    coat = coat or Coat()
     parameters = {"version": VERSION, "views": views, "test_views": test_views, "size": size, "seed": seed}
+    parameters |= asdict(coat)
     last = folder / "transforms_train.json"  # written last: its presence says that all is there
     if _parameters(last) == parameters:
         return folder
@@ -75,7 +99,7 @@ def make_sample_scene(
         transforms = folder / f"transforms_{split}.json"
         transforms.unlink(missing_ok=True)
         if count:
-            in_threads(partial(_write_view, folder, split, mesh, cameras, seed), range(count))
+            in_threads(partial(_write_view, folder, split, mesh, cameras, seed, coat), range(count))
             _write_transforms(transforms, cameras, split, parameters)
     return folder
 
@@ -106,7 +130,9 @@ def sample_cameras(count: int, size: int, turn: float = 0.0) -> Cameras:
     )
 
 
-def render_view(mesh: trimesh.Trimesh, cameras: Cameras, i: int, seed: int) -> tuple[Array, Array, Array]:
+def render_view(
+    mesh: trimesh.Trimesh, cameras: Cameras, i: int, seed: int, coat: Coat
+) -> tuple[Array, Array, Array]:
     """Photograph [H,W,3], mask [H,W] and plate [H,W,3] of camera i, all in [0, 1]; edges are as soft as pixels are."""
     width, height = (int(s) for s in cameras.size[i])
     fine = SUPERSAMPLES
@@ -120,7 +146,7 @@ def render_view(mesh: trimesh.Trimesh, cameras: Cameras, i: int, seed: int) -> t
     face = np.asarray(mesh.ray.intersects_first(origins[near], directions[near]))
     hit, face = near[face >= 0], face[face >= 0]
     photograph, mask = plate.copy(), np.zeros(len(plate))
-    photograph[hit], mask[hit] = _shaded(mesh, face, origins[hit], directions[hit], seed), 1.0
+    photograph[hit], mask[hit] = _shaded(mesh, face, origins[hit], directions[hit], seed, coat), 1.0
 
     def pooled(values: Array) -> Array:
         channels = values.reshape(height, fine, width, fine, -1).mean(axis=(1, 3))
@@ -130,7 +156,7 @@ def render_view(mesh: trimesh.Trimesh, cameras: Cameras, i: int, seed: int) -> t
 
 
 def _shaded(
-    mesh: trimesh.Trimesh, face: NDArray[np.int64], origins: Array, directions: Array, seed: int
+    mesh: trimesh.Trimesh, face: NDArray[np.int64], origins: Array, directions: Array, seed: int, coat: Coat
 ) -> Array:
     """[M,3] colours where rays meet these faces, with normals interpolated between the vertices."""
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]]
@@ -141,15 +167,22 @@ def _shaded(
     weights = np.clip(trimesh.triangles.points_to_barycentric(corners, points), 0, 1)
     normals = np.einsum("ij,ijk->ik", weights, np.asarray(mesh.vertex_normals)[np.asarray(mesh.faces)[face]])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    light = np.full(len(points), AMBIENT)
+    light, highlight = np.full(len(points), AMBIENT), np.zeros(len(points))
     for towards, strength in LIGHTS:
+        lamp = np.array(towards) / np.linalg.norm(towards)
         # half-Lambert: as soft as a lamp of the size of a wall
-        light += strength * (0.5 + 0.5 * normals @ (np.array(towards) / np.linalg.norm(towards))) ** 2
-    return np.clip(figure_colors(points, seed) * light[:, None], 0, 1)
+        light += strength * (0.5 + 0.5 * normals @ lamp) ** 2
+        halfway = lamp - directions
+        halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
+        highlight += strength * np.clip((normals * halfway).sum(axis=1), 0, 1) ** (2 / coat.roughness**4 - 2)
+    colors = figure_colors(points, seed) * light[:, None] + coat.gloss * highlight[:, None]
+    return np.clip(colors, 0, 1)
 
 
-def _write_view(folder: Path, split: str, mesh: trimesh.Trimesh, cameras: Cameras, seed: int, i: int) -> None:
-    photograph, mask, plate = render_view(mesh, cameras, i, seed)
+def _write_view(
+    folder: Path, split: str, mesh: trimesh.Trimesh, cameras: Cameras, seed: int, coat: Coat, i: int
+) -> None:
+    photograph, mask, plate = render_view(mesh, cameras, i, seed, coat)
     names = _names(split, i)
     for name, picture in zip(names, (photograph, mask, plate), strict=True):
         pixels = np.round(255 * picture).astype(np.uint8)
@@ -161,7 +194,7 @@ def _names(split: str, i: int) -> tuple[str, str, str]:
     return f"{split}/{i:03d}.png", f"mask/{split}_{i:03d}.png", f"background/{split}_{i:03d}.png"
 
 
-def _write_transforms(path: Path, cameras: Cameras, split: str, parameters: dict[str, int]) -> None:
+def _write_transforms(path: Path, cameras: Cameras, split: str, parameters: dict[str, float]) -> None:
     to_world = camtoworld_vision_to_graphics_4x4(torch.linalg.inv(cameras.world_to_camera))
     K, size = cameras.K[0], cameras.size[0]
     frames = []
@@ -199,9 +232,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--test-views", type=int, default=4)
     parser.add_argument("--size", type=int, default=256, help="of the square pictures, pixels")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--gloss", type=float, default=Coat.gloss, help="strength of highlights, 0: matte")
+    parser.add_argument("--roughness", type=float, default=Coat.roughness, help="of the gloss, above 0 to 1")
     options = parser.parse_args(arguments)
     try:
-        make_sample_scene(options.folder, options.views, options.test_views, options.size, options.seed)
+        coat = Coat(options.gloss, options.roughness)
+        make_sample_scene(options.folder, options.views, options.test_views, options.size, options.seed, coat)
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

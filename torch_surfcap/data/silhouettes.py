@@ -1,5 +1,5 @@
 """Silhouettes of photographs that come without a mask: by a picture of the empty room, or by a black background; and
-given masks that are wider than the subject before a background of one colour, cut back.
+given masks that are wider or narrower than the subject before a background of one colour, corrected.
 
 A silhouette that loses a piece of the subject carves it out of the hull for good, one that is a little fat does not:
 where it is doubtful, the subject wins.
@@ -20,9 +20,9 @@ from torch_surfcap.data.plates import separate
 
 VALLEY_SLACK = 1.15  # histogram levels up to this multiple of the valley's bottom belong to the valley
 DARK = 0.25  # a background whose median is brighter than this is not black
-ONE_COLOR, UNIFORM = 0.02, 0.95  # how near to the background's colour, and what share of it is
-TOO_WIDE = 0.5  # share of the masks' rims that shows the background
-FARTHEST_CUT = 32  # pixels
+ONE_COLOR, UNIFORM = 0.02, 0.9  # how near to the background's colour, and what share of it is
+TOO_WIDE, TOO_NARROW = 0.5, 0.75  # share of the pixels at the masks' borders that are on the wrong side
+FARTHEST = 32  # pixels that a mask is corrected by
 
 
 def find_silhouette(photograph: Picture, plate: Picture | None) -> Plane | None:
@@ -64,37 +64,53 @@ def _soft_edge(binary: Binary, contrast: Plane) -> Plane:
     return np.where(border, fraction, binary).astype(np.float32)
 
 
-def cut_back(photographs: Sequence[Picture], masks: Sequence[Plane]) -> tuple[list[Plane], int]:
-    """The masks without the background that they include, and by how many pixels they were cut at most.
+def fit_to_background(photographs: Sequence[Picture], masks: Sequence[Plane]) -> tuple[list[Plane], int]:
+    """Masks that end where the background does, and by how many pixels at most they were widened (cut where negative).
 
-    Only where the background beyond the masks is of one colour in all pictures: as long as most of the masks' rims shows
-    that colour, the pixels of the rims that do are taken away. Masks that follow the subject stay as they are, also
-    where it is here and there of that colour itself.
+    Only where the background beyond the masks is of one colour in all pictures. As long as most of the masks' outermost
+    pixels show that colour, those that do are taken away; as long as nearly all pixels beside the masks do not, these
+    are added. Masks that follow the subject stay as they are, also where it is here and there of that colour itself.
     """
-    beyond = [as_float(p[m == 0][::17]) for p, m in zip(photographs, masks, strict=True)]
-    colors = np.concatenate([*beyond, np.empty((0, 3), np.float32)])
+    beyond = [p[m == 0][::17] for p, m in zip(photographs, masks, strict=True)]
+    colors = as_float(np.concatenate(beyond))
     if len(colors) == 0:
         return list(masks), 0
     background = np.median(colors, axis=0)
-    if _alike(colors, background).mean() < UNIFORM:
+    if (np.abs(colors - background).max(axis=1) < ONE_COLOR).mean() < UNIFORM:
         return list(masks), 0
-    cut = list(masks)
-    for pixels in range(FARTHEST_CUT):
-        rims = [_rim(mask) for mask in cut]
-        alike = [_alike(as_float(p[rim]), background) for p, rim in zip(photographs, rims, strict=True)]
-        if not np.concatenate(alike).mean() > TOO_WIDE:  # nor where no rim is left
-            return cut, pixels
-        for i, (rim, away) in enumerate(zip(rims, alike, strict=True)):
-            cut[i] = cut[i].copy()
-            cut[i][rim] = np.where(away, 0, cut[i][rim])
-    return list(masks), 0  # a subject of the background's colour, not a wide mask
+    contrast = [np.abs(as_float(p) - background).max(axis=2) for p in photographs]
+    empty = [c < ONE_COLOR for c in contrast]
+    for sign in (-1, 1):
+        fitted = list(masks)
+        for pixels in range(FARTHEST):
+            rims = [_rim(mask, sign) for mask in fitted]
+            wrong = [rim & (e if sign < 0 else ~e) for rim, e in zip(rims, empty, strict=True)]
+            share = sum(map(np.count_nonzero, wrong)) / max(1, sum(map(np.count_nonzero, rims)))
+            if share <= (TOO_WIDE if sign < 0 else TOO_NARROW):
+                if pixels == 0:
+                    break
+                return list(map(_with_coverage, fitted, contrast)), sign * pixels
+            fitted = [np.where(w, np.float32(sign > 0), m) for m, w in zip(fitted, wrong, strict=True)]
+    return list(masks), 0  # else a subject of the background's colour, or a background that is not one
 
 
-def _alike(colors: Picture, background: Picture) -> NDArray[np.bool_]:
-    return np.asarray(np.abs(colors - background).max(axis=-1) < ONE_COLOR)
+def _with_coverage(mask: Plane, contrast: Plane) -> Plane:
+    """A mask that holds every pixel with some of the subject, its outermost ones as their contrast to the background is to
+    that of the pixels nearby that hold nothing else."""
+    binary = (mask >= 0.5).astype(np.float32)
+    inner = cv2.erode(binary, np.ones((3, 3), np.uint8))
+    nearby, count = (cv2.blur(plane, (5, 5)) for plane in (inner * contrast, inner))
+    known = (binary > inner) & (nearby > 1e-3 * count)
+    return np.where(known, np.clip(contrast * count / np.where(known, nearby, 1), 0, 1), binary).astype(
+        np.float32
+    )
 
 
-def _rim(mask: Plane) -> NDArray[np.bool_]:
-    """[H, W] the pixels within a mask that have one beyond it among their 8 neighbours."""
-    binary = (mask >= 0.5).astype(np.uint8)
-    return np.asarray(binary > cv2.erode(binary, np.ones((3, 3), np.uint8)))
+def _rim(mask: Plane, sign: int) -> NDArray[np.bool_]:
+    """[H, W] the pixels of a mask that touch those beyond it (8 neighbours), or, with sign 1, those beyond that touch it."""
+    ring = np.ones((3, 3), np.uint8)
+    if sign < 0:
+        binary = (mask >= 0.5).astype(np.uint8)
+        return np.asarray(binary > cv2.erode(binary, ring))
+    binary = (mask > 0).astype(np.uint8)
+    return np.asarray(binary < cv2.dilate(binary, ring))
