@@ -79,6 +79,8 @@ def test_the_shipped_table(tmp_path: Path) -> None:
         assert len(set(group.rows.values())) == len(group.rows) > 0
         assert set(group.scenes) <= set(shipped.scenes)
     assert [row.error for row in rows if row.group is None] == ["", ""]
+    alone = {row.opacity for row in plan(shipped, {"lego": tmp_path}, list(shipped.groups))}
+    assert alone == set(shipped.scenes["lego"].opacity) == {"distance"}
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ NO_PART_OF_A_FIT = {"ablation.py", "score_table.py"}
 class Scene:
     settings: str = "data.holdout=8"  # key=value ..., of every row on this scene
     millimetres: float | None = None  # of the capture's unit of length; None: not known
+    opacity: list[str] = field(default_factory=lambda: ["distance", "transparency"])
 
 
 @dataclass
@@ -110,7 +111,8 @@ def _chosen(table: Table, scene: str, names: Sequence[str]) -> Iterator[tuple[st
     """Opacity, group, name and changes of a scene's rows."""
     groups = [table.groups[name] for name in names]
     groups = [group for group in groups if scene in group.scenes or not group.scenes]
-    for opacity in dict.fromkeys(name for group in groups for name in group.opacity):
+    tried = table.scenes.get(scene, Scene()).opacity
+    for opacity in dict.fromkeys(name for group in groups for name in group.opacity if name in tried):
         here = [group for group in groups if opacity in group.opacity]
         if not all(group.columns for group in here):
             yield opacity, None, "baseline", ""

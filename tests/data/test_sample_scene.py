@@ -55,12 +55,12 @@ def test_the_surface_projects_into_the_masks(folder: Path) -> None:
         assert drawn[inside].mean() > 0.99
 
 
-def test_a_coat_adds_highlights_and_nothing_else(folder: Path, tmp_path: Path) -> None:
-    matte = load_capture(folder)
+def test_a_coat_adds_highlights_and_nothing_else(tmp_path: Path) -> None:
+    matte = load_capture(make_sample_scene(tmp_path / "matte", 3, 0, 64))
     assert matte.masks is not None
     lit = {}
     for roughness in (0.3, 0.6):
-        glossy = load_capture(make_sample_scene(tmp_path / "gloss", 3, 1, 192, coat=Coat(1.5, roughness)))
+        glossy = load_capture(make_sample_scene(tmp_path / "gloss", 3, 0, 64, coat=Coat(1.5, roughness)))
         assert glossy.masks is not None
         more = glossy.photograph(0) - matte.photograph(0)
         assert torch.equal(glossy.masks[0], matte.masks[0])
