@@ -104,6 +104,7 @@ class Config:
     opacity: str | None = _one_of(None, *LOSSES)  # what a voxel stores
     gains: str = _one_of("auto", *CHOICES["gains"])  # gain and bias per camera
     gain_per: str = _one_of("channel", *CHOICES["gain_per"])  # what has a gain and bias of its own
+    floor: str = _one_of("auto", *CHOICES["floor"])  # nothing lies below the one that the plates show
     start: str | None = _one_of(None, *CHOICES["start"])  # the first field of a transparency
     upscale: str | None = _one_of(None, *CHOICES["upscale"])  # of a transparency to the next level
     gradient: str = _one_of("scatter", "scatter", "gather")  # exact, or read by the voxels (paper, eq. 19)
@@ -178,6 +179,7 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "levels": config.levels,
         "gains": config.gains,
         "gain_per": config.gain_per,
+        "floor": config.floor,
         "start": config.start,
         "upscale": config.upscale,
         "box": None if config.data.box is None else tuple(config.data.box),
@@ -337,5 +339,5 @@ def _check(config: Any, source: str, prefix: str = "") -> None:
 
 
 # Fields in which "auto" is a word like any other.
-_SAYS_ON = {"gains"}  # and on and off, which YAML takes for true and false
-_SAYS_AUTO = {"data.format", "device", "gains"}
+_SAYS_ON = {"gains", "floor"}  # and on and off, which YAML takes for true and false
+_SAYS_AUTO = {"data.format", "device", "gains", "floor"}

@@ -121,12 +121,13 @@ def test_masks_are_corrected_by_a_background_of_one_colour() -> None:
     true = subject.astype(np.float32)
     for wide in (1, 5):
         ring = np.ones((2 * wide + 1, 2 * wide + 1), np.uint8)
-        (cut,), pixels = fit_to_background([picture], [cv2.dilate(true, ring)])
+        fat, thin = (change(true, ring).astype(np.float32) for change in (cv2.dilate, cv2.erode))
+        (cut,), pixels = fit_to_background([picture], [fat])
         assert pixels == -wide
         assert cut[~subject].sum() == 0
         assert cut[subject].mean() > 0.97  # but for the white place
         assert cut[rod].all()
-        (grown,), pixels = fit_to_background([picture], [cv2.erode(true, ring)])
+        (grown,), pixels = fit_to_background([picture], [thin])
         assert pixels == wide
         assert grown[~subject].sum() == 0
         assert grown[disk].mean() > 0.97

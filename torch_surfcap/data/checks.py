@@ -65,10 +65,10 @@ def _find_masks(capture: Capture, shadows: bool = True) -> Capture:
     photographs = [image.numpy() for image in capture.images]
     if capture.masks is not None:
         if capture.plates is None:  # else these show where the subject is
-            masks, pixels = fit_to_background(photographs, [mask.numpy() for mask in capture.masks])
+            fitted, pixels = fit_to_background(photographs, [mask.numpy() for mask in capture.masks])
             if pixels:
                 what = "cut a part of the subject off" if pixels > 0 else "include the background"
-                found.masks = [torch.from_numpy(mask) for mask in masks]
+                found.masks = [torch.from_numpy(mask) for mask in fitted]
                 found.warnings.append(f"masks: {what}, corrected by up to {abs(pixels)} pixels")
         return found
     if capture.plates is not None:

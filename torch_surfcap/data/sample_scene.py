@@ -78,8 +78,14 @@ def make_sample_scene(
     """
     folder = Path(folder)
     coat = coat or Coat()
-    parameters = {"version": VERSION, "views": views, "test_views": test_views, "size": size, "seed": seed}
-    parameters |= asdict(coat)
+    parameters: dict[str, float] = {
+        "version": VERSION,
+        "views": views,
+        "test_views": test_views,
+        "size": size,
+        "seed": seed,
+        **asdict(coat),
+    }
     last = folder / "transforms_train.json"  # written last: its presence says that all is there
     if _parameters(last) == parameters:
         return folder

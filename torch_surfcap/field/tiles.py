@@ -145,7 +145,7 @@ class TileGrid:
         return TileGrid.build(stored, inside, self.origin, self.voxel_size / 2)
 
 
-def voxel_centers(grid: TileGrid, tiles: slice = slice(None)) -> Tensor:
+def voxel_centers(grid: TileGrid, tiles: slice | Tensor = slice(None)) -> Tensor:
     """[T, 4, 4, 4, 3] float64 world positions of the voxels of the stored tiles."""
     steps = torch.arange(TILE, dtype=torch.float64, device=grid.coords.device) + 0.5
     inner = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import prepare
+from torch_surfcap.data.floor import find_floor
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.fitting.budget import Budget, estimate, shortage
@@ -102,10 +103,12 @@ def fit(
     degree = DEFAULT_DEGREE if s.sh_degree is None else s.sh_degree
     box = subject_box(capture, s.box) if saved is None else saved.box
     plan = plan_levels(capture, box, s.voxel, s.levels)
-    studio = open_studio(capture, s, plan[0].halvings)
+    floor = find_floor(capture, box) if s.floor == "auto" else None
+    watch.lap("floor")
+    studio = open_studio(capture, s, plan[0].halvings, floor)
     so_far = Record(list(capture.warnings))
     if saved is None:
-        grid, store = first_field(studio.pictures[-1], box, plan[0].voxel_size, s, degree)
+        grid, store = first_field(studio.pictures[-1], box, plan[0].voxel_size, s, degree, floor)
         watch.lap("hull")
         budget = estimate(capture, plan, grid, store, s)
         so_far.level_bytes = budget.level_bytes
@@ -137,7 +140,7 @@ def fit(
             checkpoints.save(s, capture, box, stage, studio, so_far)
     watch.lap("fit")
     step = stage.march.step / stage.grid.voxel_size
-    surface = SurfaceField(stage.decoded(s.opacity), stage.grid, s.opacity, step)
+    surface = SurfaceField(stage.decoded(s.opacity, floor), stage.grid, s.opacity, step)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:
@@ -183,6 +186,10 @@ def _chosen(
         "box": {
             "value": [*box[0].tolist(), *box[1].tolist()],
             "reason": "silhouettes" if s.box is None else "given",
+        },
+        "floor": {
+            "value": studio.floor and [*studio.floor.normal.tolist(), studio.floor.offset],
+            "reason": "off" if s.floor == "off" else "plates" if studio.floor else "none seen",
         },
         "mask": {"value": s.losses.mask, "reason": f"silhouettes by {studio.pictures[0].mask_source}"},
         "gains": {

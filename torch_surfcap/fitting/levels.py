@@ -12,10 +12,11 @@ from torch import Tensor
 from torch_surfcap import ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.floor import Floor
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import CLAMP, MISSING
 from torch_surfcap.field.hull import Silhouettes, find_box, pixel_footprint
-from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.field.tiles import TileGrid, voxel_centers
 from torch_surfcap.fitting.budget import shortage
 from torch_surfcap.fitting.rays import QUIET, RayBatch
 from torch_surfcap.fitting.settings import FitSettings
@@ -72,13 +73,18 @@ def subject_box(capture: Capture, box: tuple[float, ...] | None) -> tuple[Tensor
 
 
 def first_field(
-    capture: Capture, box: tuple[Tensor, Tensor], voxel_size: float, settings: FitSettings, sh_degree: int
+    capture: Capture,
+    box: tuple[Tensor, Tensor],
+    voxel_size: float,
+    settings: FitSettings,
+    sh_degree: int,
+    floor: Floor | None = None,
 ) -> tuple[TileGrid, Tensor]:
     """Grid and padded records [T, 4, 4, 4, P] of the coarsest level, out of the soft hull.
 
     The hull of masks grown by a pixel is widened by a voxel, so that no thin part is lost on the coarse grid. A signed
     distance starts as the distance to it, a transparency as thin fog inside it, or, where ``settings.start`` is "hull",
-    falling off from its surface; all grey.
+    falling off from its surface; all grey. Nothing of it lies below a floor.
     """
     opacity = settings.opacity
     low, high = box
@@ -93,6 +99,8 @@ def first_field(
     steps = [(torch.arange(n * ops.TILE, dtype=torch.float64) + 0.5) * voxel_size for n in size]
     points = torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + corner
     hull = binary_dilation(Silhouettes.of(capture, grow=1).occupied(points).numpy())
+    if floor is not None:
+        hull &= (floor.height(points) > 0).numpy()
     if not hull.any():
         raise InputError("silhouettes: the visual hull is empty inside the box, expected a subject there")
     distance = torch.from_numpy(distance_transform_edt(~hull) - distance_transform_edt(hull)).float()
@@ -147,3 +155,18 @@ def next_level(
     elif settings.upscale == "sqrt":
         values[..., 0].sqrt_()
     return fine, values
+
+
+def cut_at_floor(grid: TileGrid, store: Tensor, opacity: str, floor: Floor | None) -> None:
+    """Takes what lies below the floor out of a field, in place: the intersection with the space above it."""
+    if floor is None:
+        return
+    reach = ops.TILE * grid.voxel_size * math.sqrt(3)
+    low = torch.tensor(grid.origin, dtype=torch.float64) + grid.coords.double() * ops.TILE * grid.voxel_size
+    near = (floor.height(low) < reach).nonzero()[:, 0]
+    height = (floor.height(voxel_centers(grid, near)) / grid.voxel_size).to(store.dtype)
+    value = store[near, ..., 0]
+    if opacity == "distance":
+        store[near, ..., 0] = torch.maximum(value, -height).clamp(max=CLAMP)
+    else:  # as much of a voxel as is above
+        store[near, ..., 0] = torch.lerp(torch.ones_like(value), value, (height + 0.5).clamp(0, 1))

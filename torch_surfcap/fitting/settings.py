@@ -66,6 +66,7 @@ SMOOTH = {"distance": 5, "transparency": 120}
 CHOICES = {
     "gains": ("auto", "on", "off"),
     "gain_per": ("channel", "camera"),
+    "floor": ("auto", "off"),
     "start": ("hull", "constant"),
     "upscale": ("plain", "sqrt"),
 }
@@ -86,6 +87,7 @@ class FitSettings:
                brings far more where they are not. View-dependent colours (sh_degree > 0) take a part of what are gains:
                their values are then less true, the pictures are not
     gain_per:  "channel" or "camera", what has a gain and bias of its own
+    floor:     "auto": nothing lies below the floor that the plates show, where they show one; "off"
     start:     "hull": the first field falls off at the hull's surface; "constant": a transparency is the same fog inside
     upscale:   "plain" or "sqrt": a transparency at a change of level stays, or becomes its root, so that two fine voxels
                stop as much light as the coarse one did
@@ -108,6 +110,7 @@ class FitSettings:
     box: tuple[float, ...] | None = None
     gains: str = "auto"
     gain_per: str = "channel"
+    floor: str = "auto"
     start: str = "constant"
     upscale: str = "plain"
     seed: int = 0

@@ -11,11 +11,12 @@ from torch import Tensor
 from torch_surfcap import codes, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.floor import Floor
 from torch_surfcap.field.field import MISSING, SLOPE
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.color_gain import Exposure
-from torch_surfcap.fitting.levels import Level, next_level
+from torch_surfcap.fitting.levels import Level, cut_at_floor, next_level
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, gather_rays
 from torch_surfcap.fitting.settings import FitSettings
@@ -26,7 +27,8 @@ class Studio:
     """What does not belong to one level: the photographs at every size and the cameras' exposure.
 
     pictures: the capture, halved 0, 1, ... times. backdrop: see ``RayBatch.expose``. generator: of the lattices' shifts.
-    gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera.
+    gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera. floor: below
+    which nothing is, where one was found.
     """
 
     pictures: list[Capture]
@@ -35,6 +37,7 @@ class Studio:
     gains: bool
     per_channel: bool
     generator: torch.Generator
+    floor: Floor | None = None
 
     def fit_exposure(self, stage: Stage, color: Tensor, transmittance: Tensor) -> None:
         """Takes the cameras' gains out of renderings of a stage's rays, [R, 3] and [R], and exposes the rays anew."""
@@ -70,9 +73,11 @@ class Stage:
         """The grid's table, where the whole box is visited without what it says about empty space."""
         return self.grid.table.clamp(min=ops.OUTSIDE) if settings.descent.visit == "box" else self.grid.table
 
-    def decoded(self, opacity: str) -> Tensor:
-        """The records in floats."""
-        return codes.decode(self.store, *MISSING[opacity])
+    def decoded(self, opacity: str, floor: Floor | None) -> Tensor:
+        """The records in floats, cut at the floor; those of the stage may be so, too."""
+        store = codes.decode(self.store, *MISSING[opacity])
+        cut_at_floor(self.grid, store, opacity, floor)
+        return store
 
 
 def march_of(settings: FitSettings, level: Level, last: bool) -> March:
@@ -101,7 +106,7 @@ def begin_stage(
     return Stage(number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations))
 
 
-def open_studio(capture: Capture, settings: FitSettings, halvings: int) -> Studio:
+def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: Floor | None = None) -> Studio:
     """The pictures down to so many halvings, all exposed as they are."""
     pictures = [capture]
     while len(pictures) <= halvings:
@@ -110,13 +115,14 @@ def open_studio(capture: Capture, settings: FitSettings, halvings: int) -> Studi
     equal = Exposure.equal(len(capture))
     per_channel = settings.gain_per == "channel"
     gains = settings.gains != "off"
-    return Studio(pictures, choose_backdrop(capture), equal, gains, per_channel, generator)
+    return Studio(pictures, choose_backdrop(capture), equal, gains, per_channel, generator, floor)
 
 
 def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:
     """The level after one that is done."""
     watch = Stopwatch({})
-    grid, store = next_level(stage.grid, stage.decoded(settings.opacity), settings, stage.rays, stage.march)
+    done = stage.decoded(settings.opacity, studio.floor)
+    grid, store = next_level(stage.grid, done, settings, stage.rays, stage.march)
     following = begin_stage(settings, plan, stage.number + 1, grid, store, studio)
     watch.lap("prepare")
     following.seconds |= watch.seconds
