@@ -22,6 +22,7 @@ VALLEY_SLACK = 1.15  # histogram levels up to this multiple of the valley's bott
 DARK = 0.25  # a background whose median is brighter than this is not black
 ONE_COLOR, UNIFORM = 0.02, 0.9  # how near to the background's colour, and what share of it is
 TOO_WIDE, TOO_NARROW = 0.5, 0.75  # share of the pixels at the masks' borders that are on the wrong side
+UNMIXED = 0.85  # mean contrast of pixels at the border, relative to those further in
 FARTHEST = 32  # pixels that a mask is corrected by
 
 
@@ -86,24 +87,35 @@ def fit_to_background(photographs: Sequence[Picture], masks: Sequence[Plane]) ->
             rims = [_rim(mask, sign) for mask in fitted]
             wrong = [rim & (e if sign < 0 else ~e) for rim, e in zip(rims, empty, strict=True)]
             share = sum(map(np.count_nonzero, wrong)) / max(1, sum(map(np.count_nonzero, rims)))
-            if share <= (TOO_WIDE if sign < 0 else TOO_NARROW):
-                if pixels == 0:
-                    break
-                return list(map(_with_coverage, fitted, contrast)), sign * pixels
-            fitted = [np.where(w, np.float32(sign > 0), m) for m, w in zip(fitted, wrong, strict=True)]
+            right = share <= (TOO_WIDE if sign < 0 else TOO_NARROW)
+            if right and pixels == 0:
+                break
+            if not right or sign > 0:  # at last pixels that hold only a little of the subject
+                fitted = [np.where(w, np.float32(sign > 0), m) for m, w in zip(fitted, wrong, strict=True)]
+            if right:
+                return _with_coverage(fitted, contrast), sign * pixels
     return list(masks), 0  # else a subject of the background's colour, or a background that is not one
 
 
-def _with_coverage(mask: Plane, contrast: Plane) -> Plane:
-    """A mask that holds every pixel with some of the subject, its outermost ones as their contrast to the background is to
-    that of the pixels nearby that hold nothing else."""
-    binary = (mask >= 0.5).astype(np.float32)
-    inner = cv2.erode(binary, np.ones((3, 3), np.uint8))
-    nearby, count = (cv2.blur(plane, (5, 5)) for plane in (inner * contrast, inner))
-    known = (binary > inner) & (nearby > 1e-3 * count)
-    return np.where(known, np.clip(contrast * count / np.where(known, nearby, 1), 0, 1), binary).astype(
-        np.float32
-    )
+def _with_coverage(masks: Sequence[Plane], contrast: Sequence[Plane]) -> list[Plane]:
+    """Masks that hold every pixel with some of the subject, their outermost ones as their contrast to the background is to
+    that of the pixels nearby that hold nothing else.
+
+    Where these contrasts do not differ, the photographs' colours are not mixed with the background (the colours of an
+    alpha picture): the outermost pixels then count half.
+    """
+    found = []
+    for mask, against in zip(masks, contrast, strict=True):
+        binary = (mask >= 0.5).astype(np.float32)
+        inner = cv2.erode(binary, np.ones((3, 3), np.uint8))
+        nearby, count = (cv2.blur(plane, (5, 5)) for plane in (inner * against, inner))
+        rim = (binary > inner) & (nearby > 1e-3 * count)
+        binary[rim] = np.clip(against[rim] * count[rim] / nearby[rim], 0, 1)
+        found.append((binary, rim))
+    mixed = np.concatenate([mask[rim] for mask, rim in found])
+    if len(mixed) and mixed.mean() > UNMIXED:
+        return [np.where(rim, np.float32(0.5), mask) for mask, rim in found]
+    return [mask for mask, _ in found]
 
 
 def _rim(mask: Plane, sign: int) -> NDArray[np.bool_]:
