@@ -55,21 +55,21 @@ def find_floor(capture: Capture, box: tuple[Tensor, Tensor]) -> Floor | None:
     low, high = box
     middle, unit = (low + high) / 2, float((high - low).norm()) / 2
     up = torch.nn.functional.normalize(-capture.cameras.world_to_camera[:, 1, :3].mean(0), dim=0)
-    if not up.isfinite().all() or float(up.norm()) < 0.5:  # cameras that look every way up
+    if float(up.norm()) < 0.5:  # cameras that look every way up
         return None
     spacing = SPACING * 2 * RADIUS * unit
-    agreement = _agreement(capture, middle, up, RADIUS * unit, spacing, COARSE)
+    coarse = _agreement(capture, middle, up, RADIUS * unit, spacing, COARSE)
     depths = np.arange(DEPTHS[0], DEPTHS[1], spacing / unit)
-    found = np.array([agreement(np.array([0.0, 0.0, depth])) for depth in depths])
+    found = np.array([coarse(np.array([0.0, 0.0, depth])) for depth in depths])
     at = np.array([0.0, 0.0, depths[found.argmax()]])
     if found.max() < AGREE / 2 or np.quantile(found, 0.8) > NO_FLOOR * found.max():
         return None
-    for pixel, detail in ((spacing, COARSE), (0.5 * spacing, FINE)):
-        agreement = _agreement(capture, middle, up, RADIUS * unit, pixel, detail)
+    fine = _agreement(capture, middle, up, RADIUS * unit, 0.5 * spacing, FINE)
+    for agreement, pixel in ((coarse, spacing), (fine, 0.5 * spacing)):
         corners = np.vstack([at, at + np.diag([pixel, pixel, 0.5 * pixel]) / unit])
         options = {"initial_simplex": corners, "xatol": 1e-4, "fatol": 1e-4, "maxfev": 100}
         at = minimize(lambda x, f=agreement: -f(x), at, method="Nelder-Mead", options=options).x
-    agreement_there = agreement(at)
+    agreement_there = fine(at)
     if agreement_there < AGREE:
         return None
     normal, point = _plane(at, middle, up, unit)

@@ -103,6 +103,7 @@ def fit(
     degree = DEFAULT_DEGREE if s.sh_degree is None else s.sh_degree
     box = subject_box(capture, s.box) if saved is None else saved.box
     plan = plan_levels(capture, box, s.voxel, s.levels)
+    watch.lap("box")
     floor = find_floor(capture, box) if s.floor == "auto" else None
     watch.lap("floor")
     studio = open_studio(capture, s, plan[0].halvings, floor)
