@@ -34,8 +34,8 @@ def threads() -> Iterator[None]:
 
 
 @cache
-def ball_fit(opacity: str, storage: int, accumulator: int) -> FitResult:
-    bits: dict[str, Any] = {"storage": storage, "accumulator": accumulator}
+def ball_fit(opacity: str, storage: int, accumulator: int, seed: int = 0) -> FitResult:
+    bits: dict[str, Any] = {"storage": storage, "accumulator": accumulator, "seed": seed}
     return fit(ball(side=32), opacity=opacity, sh_degree=1, levels=2, voxel=VOXEL, **bits)
 
 
@@ -44,9 +44,10 @@ def error(result: FitResult) -> float:
     return float(np.abs(np.linalg.norm(result.mesh.vertices - np.array(CENTER), axis=1) - RADIUS).mean())
 
 
-def rest(result: FitResult) -> float:
-    """The photographs' loss in the end; an iteration's lattices alone change it by some percent."""
-    return float(np.mean([row["photo"] for row in result.history[-5:]]))
+def rest(opacity: str, storage: int, accumulator: int) -> float:
+    """The photographs' loss in the end: of several iterations and seeds, which differ by a tenth among themselves."""
+    fits = [ball_fit(opacity, storage, accumulator, seed) for seed in range(3)]
+    return float(np.mean([row["photo"] for result in fits for row in result.history[-5:]]))
 
 
 @pytest.mark.parametrize(("storage", "accumulator"), [(16, 16), (8, 32), (8, 16)])
@@ -57,7 +58,7 @@ def test_ball(opacity: str, storage: int, accumulator: int) -> None:
     assert narrow.field.voxels.dtype == torch.float32
     assert error(narrow) < error(plain) + 0.05 * VOXEL
     assert narrow.mesh.body_count == 1
-    assert rest(narrow) < 1.3 * rest(plain)  # seeds alone differ by 1.13
+    assert rest(opacity, storage, accumulator) < 1.2 * rest(opacity, 32, 32)
 
 
 def test_same_bits_on_any_threads(threads: None) -> None:
