@@ -153,6 +153,19 @@ template <class Real> struct RaysArgument {
         view{origins.data(), directions.data(), shift.data(), background.data(), o.size(0), nullptr, nullptr, 1} {}
 };
 
+// What rays see, in fresh tensors.
+template <class Real> struct NewRendering {
+  Tensor color, transmittance, depth;
+  Rendering<Real> view;
+
+  NewRendering(const Tensor& like, int64_t rays)
+      : color(torch::stable::new_empty(like, {rays, 3})),
+        transmittance(torch::stable::new_empty(like, {rays})),
+        depth(torch::stable::new_empty(like, {rays})),
+        view{color.template mutable_data_ptr<Real>(), transmittance.template mutable_data_ptr<Real>(),
+             depth.template mutable_data_ptr<Real>()} {}
+};
+
 // The integration ranges of rays, where the caller has them.
 template <class Real> struct RangesArgument {
   std::optional<Input<int64_t>> offsets;

@@ -14,11 +14,13 @@
 STABLE_TORCH_LIBRARY(torch_surfcap, m) {
   m.def("sample_forward(" FIELD ", Tensor points) -> Tensor");
   m.def("sample_backward(Tensor grad_values, " FIELD ", Tensor points, int groups) -> Tensor");
+  m.def("shade_forward(" FIELD ", Tensor points, Tensor directions) -> Tensor");
+  m.def("shade_backward(Tensor grad_values, " FIELD ", Tensor points, Tensor directions, int groups) -> Tensor");
   m.def("march_forward(" FIELD ", " RAYS ", " MARCH ") -> (Tensor, Tensor, Tensor)");
   m.def("march_backward(Tensor grad_color, Tensor grad_transmittance, Tensor grad_depth, " FIELD ", " RAYS ", " MARCH
         ", int groups) -> Tensor");
-  m.def("photometric_step(" PHOTOMETRIC ", Tensor(a!) gradients) -> (Tensor, Tensor, Tensor)");
-  m.def("photometric_lattice(" PHOTOMETRIC ", " SLOTS ", Tensor(a!) slots) -> (Tensor, Tensor, Tensor)");
+  m.def("photometric_step(" PHOTOMETRIC ", Tensor(a!) gradients) -> (Tensor, Tensor, Tensor, Tensor)");
+  m.def("photometric_lattice(" PHOTOMETRIC ", " SLOTS ", Tensor(a!) slots) -> (Tensor, Tensor, Tensor, Tensor)");
   m.def("gather_gradient(" FIELD
         ", Tensor coordinates, Tensor matrices, Tensor centers, Tensor windows, Tensor window_rays, Tensor shift, "
         "float step, " SLOTS ", Tensor slots, Tensor(a!) gradient) -> ()");

@@ -42,6 +42,27 @@ class SampleTiles(torch.autograd.Function):
         return by_voxels, None, None, None
 
 
+class ShadePoints(torch.autograd.Function):
+    """``apply(voxels, table, frame, points, directions) -> opacity value, r, g, b [N, 4]``. Differentiability: voxels."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, voxels: Tensor, table: Tensor, frame: list[float], points: Tensor, directions: Tensor
+    ) -> Tensor:
+        ctx.save_for_backward(voxels, table, points, directions)
+        ctx.frame = frame
+        return ops.shade_forward(voxels, table, frame, points, directions)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        voxels, table, points, directions = ctx.saved_tensors
+        by_voxels = None
+        if ctx.needs_input_grad[0]:
+            by_voxels = ops.shade_backward(grad, voxels, table, ctx.frame, points, directions)
+        return by_voxels, None, None, None, None
+
+
 class MarchRays(torch.autograd.Function):
     """``apply(voxels, background, table, frame, origins, directions, shift, march) -> colour, transmittance, depth``.
 
@@ -94,7 +115,7 @@ class MarchRays(torch.autograd.Function):
 
 class PhotometricStep(torch.autograd.Function):
     """``apply(voxels, table, frame, origins, directions, shift, background, target, mask, weight, march, huber, weights,
-    detach_sample) -> total, losses [3], colour [R, 3], transmittance [R]``.
+    detach_sample) -> total, losses [3], colour [R, 3], transmittance [R], depth [R]``.
 
     The gradient is computed together with the value. Differentiability: ``total = weights . losses`` by the voxels.
     """
@@ -116,9 +137,9 @@ class PhotometricStep(torch.autograd.Function):
         huber: float,
         weights: list[float],
         detach_sample: bool = False,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         rays, seen = (origins, directions, shift, background), (target, mask, weight)
-        losses, gradient, color, transmittance = ops.photometric_step(
+        losses, gradient, *rendering = ops.photometric_step(
             voxels,
             table,
             frame,
@@ -130,9 +151,9 @@ class PhotometricStep(torch.autograd.Function):
             detach_sample=detach_sample,
         )
         ctx.save_for_backward(gradient)
-        ctx.mark_non_differentiable(losses, color, transmittance)
+        ctx.mark_non_differentiable(losses, *rendering)
         total = losses @ losses.new_tensor(weights)
-        return total.to(voxels.dtype), losses, color, transmittance
+        return total.to(voxels.dtype), losses, *rendering
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]

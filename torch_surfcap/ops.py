@@ -85,6 +85,28 @@ def sample_backward(
     return cast(Tensor, _ops.sample_backward(grad_values, voxels, table, frame, points, groups))
 
 
+def shade_forward(
+    voxels: Tensor, table: Tensor, frame: list[float], points: Tensor, directions: Tensor
+) -> Tensor:
+    """What ``points [N, 3]`` look like along unit ``directions [N, 3]``: [N, 4] opacity value, r, g, b, as the samples of
+    a ray read them."""
+    return cast(Tensor, _ops.shade_forward(voxels, table, frame, points, directions))
+
+
+def shade_backward(
+    grad_values: Tensor,
+    voxels: Tensor,
+    table: Tensor,
+    frame: list[float],
+    points: Tensor,
+    directions: Tensor,
+    groups: int = GROUPS,
+) -> Tensor:
+    """Adjoint of :func:`shade_forward` by the voxels: [T, 4, 4, 4, P]."""
+    field, seen = (voxels, table, frame), (points, directions)
+    return cast(Tensor, _ops.shade_backward(grad_values, *field, *seen, groups))
+
+
 def march_forward(
     voxels: Tensor,
     table: Tensor,
@@ -152,7 +174,7 @@ def photometric_step(
     gradients: Tensor | None = None,
     rendered_sample: bool = False,
     bundle: int = 1,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Value and gradient of the ray losses in one call.
 
     Args:
@@ -169,8 +191,8 @@ def photometric_step(
             addition rounded to the nearest.
 
     Returns:
-        losses [3] float64, not yet times ``weights``; the gradient of ``weights . losses`` [T, 4, 4, 4, P]; the colours
-        [R, 3] and transmittances [R] of the rays.
+        losses [3] float64, not yet times ``weights``; the gradient of ``weights . losses`` [T, 4, 4, 4, P]; colours [R, 3],
+        transmittances [R] and depths [R] of the rays, as :func:`march_forward` gives them.
     """
     field, rays, seen = (
         (voxels, table, frame),
@@ -181,10 +203,10 @@ def photometric_step(
     stretches = ranges or (None, None)
     if gradients is None:
         gradients = origins.new_empty(groups, *voxels.shape)
-    losses, color, transmittance = _ops.photometric_step(
+    losses, *rendering = _ops.photometric_step(
         *field, *rays, *seen, *stretches, bundle, *march, *loss, gradients
     )
-    return losses, gradients[0], color, transmittance
+    return losses, gradients[0], *rendering
 
 
 def photometric_lattice(
@@ -212,7 +234,7 @@ def photometric_lattice(
     ranges: tuple[Tensor, Tensor] | None = None,
     rendered_sample: bool = False,
     bundle: int = 1,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """:func:`photometric_step` with the gradient left at the samples, for :func:`gather_gradient` to read.
 
     Args:
@@ -224,7 +246,7 @@ def photometric_lattice(
             too large becomes the largest).
 
     Returns:
-        losses [3] float64, not yet times ``weights``; the colours [R, 3] and transmittances [R] of the rays.
+        losses [3] float64, not yet times ``weights``; colours [R, 3], transmittances [R] and depths [R] of the rays.
     """
     field, rays, seen = (
         (voxels, table, frame),
@@ -234,7 +256,7 @@ def photometric_lattice(
     march, loss = (opacity, slope, step, stop), (huber, weights, detach_sample, rendered_sample)
     rows, stretches = (starts, first, exponent, slots), ranges or (None, None)
     return cast(
-        "tuple[Tensor, Tensor, Tensor]",
+        "tuple[Tensor, Tensor, Tensor, Tensor]",
         _ops.photometric_lattice(*field, *rays, *seen, *stretches, bundle, *march, *loss, *rows),
     )
 

@@ -10,6 +10,12 @@ import torch_surfcap._C  # noqa: F401  (loads the library, which registers the o
 fake = torch.library.register_fake
 
 
+def _rendering(origins):
+    """Colour, transmittance and depth of rays."""
+    rays = origins.shape[0]
+    return origins.new_empty(rays, 3), origins.new_empty(rays), origins.new_empty(rays)
+
+
 @fake("torch_surfcap::sample_forward")
 def _(voxels, table, frame, points):
     return voxels.new_empty(points.shape[0], voxels.shape[-1])
@@ -20,10 +26,19 @@ def _(grad_values, voxels, table, frame, points, groups):
     return voxels.new_empty(voxels.shape)
 
 
+@fake("torch_surfcap::shade_forward")
+def _(voxels, table, frame, points, directions):
+    return voxels.new_empty(points.shape[0], 4)
+
+
+@fake("torch_surfcap::shade_backward")
+def _(grad_values, voxels, *rest):
+    return voxels.new_empty(voxels.shape)
+
+
 @fake("torch_surfcap::march_forward")
 def _(voxels, table, frame, origins, *rest):
-    rays = origins.shape[0]
-    return voxels.new_empty(rays, 3), voxels.new_empty(rays), voxels.new_empty(rays)
+    return _rendering(origins)
 
 
 @fake("torch_surfcap::march_backward")
@@ -33,16 +48,12 @@ def _(grad_color, grad_transmittance, grad_depth, voxels, *rest):
 
 @fake("torch_surfcap::photometric_step")
 def _(voxels, table, frame, origins, *rest):
-    rays = origins.shape[0]
-    losses = origins.new_empty(3, dtype=torch.float64)
-    return losses, origins.new_empty(rays, 3), origins.new_empty(rays)
+    return origins.new_empty(3, dtype=torch.float64), *_rendering(origins)
 
 
 @fake("torch_surfcap::photometric_lattice")
 def _(voxels, table, frame, origins, *rest):
-    rays = origins.shape[0]
-    losses = voxels.new_empty(3, dtype=torch.float64)
-    return losses, voxels.new_empty(rays, 3), voxels.new_empty(rays)
+    return origins.new_empty(3, dtype=torch.float64), *_rendering(origins)
 
 
 @fake("torch_surfcap::gather_gradient")

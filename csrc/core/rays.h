@@ -63,16 +63,23 @@ template <class Real, int Degree, class Opacity, class Stored = Real> struct Mar
   }
 };
 
-// Colour [3], transmittance and depth (sum of w t / sum of w, NaN where the ray meets nothing) of ray i.
+// Writes what ray i sees before its background, and returns its colour in lanes 1..3.
+template <class Real>
+SURFCAP_HD Pack<Real, 4> write_ray(const RayResult<Real>& ray, const Real* background, int64_t i,
+                                   const Rendering<Real>& out) {
+  const Pack<Real, 4> color = ray.sum + ray.transmittance * color_of(background + 3 * i);
+  for (int c = 0; c < 3; ++c) out.color[3 * i + c] = color[c + 1];
+  out.transmittance[i] = ray.transmittance;
+  out.depth[i] = ray.opacity > kNothing<Real> ? ray.sum[0] / ray.opacity : Real(__builtin_nan(""));
+  return color;
+}
+
 template <class Real, int Degree, class Opacity>
-SURFCAP_HD void render_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i, Real* color,
-                           Real* transmittance, Real* depth) {
+SURFCAP_HD void render_ray(const Marcher<Real, Degree, Opacity>& march, const Rays<Real>& rays, int64_t i,
+                           const Rendering<Real>& out) {
   typename Marcher<Real, Degree, Opacity>::Walk walk;
   march.walk(walk, rays, i);
-  const RayResult<Real>& ray = walk.ray;
-  for (int c = 0; c < 3; ++c) color[3 * i + c] = ray.sum[c + 1] + ray.transmittance * rays.background[3 * i + c];
-  transmittance[i] = ray.transmittance;
-  depth[i] = ray.opacity > kNothing<Real> ? ray.sum[0] / ray.opacity : Real(__builtin_nan(""));
+  write_ray(walk.ray, rays.background, i, out);
 }
 
 // The adjoint of render_ray by the voxels.
@@ -97,15 +104,15 @@ SURFCAP_HD void render_ray_backward(const Marcher<Real, Degree, Opacity>& march,
 }
 
 // One ray of the fused step, its walk forward done: adds (photo, sample, mask), each times the ray's weight, to
-// `losses`, sends the gradient of their weighted sum `to` the voxels or to slots, and writes colour and transmittance.
+// `losses`, sends the gradient of their weighted sum `to` the voxels or to slots, and writes what the ray sees.
 template <class Real, int Degree, class Opacity, class Stored, class To>
 SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity, Stored>& march,
                                 const Walk<Real, Degree, Opacity>& walk, const Rays<Real>& rays,
                                 const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t i,
-                                double* losses, Real* color, Real* transmittance, const To& to) {
+                                double* losses, const Rendering<Real>& out, const To& to) {
   const RayResult<Real>& ray = walk.ray;
   const Pack<Real, 4> target = color_of(seen.target + 3 * i), background = color_of(rays.background + 3 * i);
-  const Pack<Real, 4> rendered = ray.sum + ray.transmittance * background;
+  const Pack<Real, 4> rendered = write_ray(ray, rays.background, i, out);
   const Real weight = seen.weight[i];
   Pack<Real, 4> by_color = zero_pack<Real, 4>();
   Real photo = Real(0);
@@ -113,9 +120,7 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity, Stored>& ma
     Real derivative;
     photo += huber(rendered[c] - target[c], loss.huber, derivative);
     by_color[c] = weight * loss.photo * derivative;
-    color[3 * i + c - 1] = rendered[c];
   }
-  transmittance[i] = ray.transmittance;
   const Real excess = ray.transmittance - Real(1) + seen.mask[i];
   const Real r_inf = dot_color<Real>(by_color, background) + Real(2) * weight * loss.mask * excess;
   const Real sample_weight = weight * loss.sample;
@@ -142,14 +147,13 @@ SURFCAP_HD void photometric_ray(const Marcher<Real, Degree, Opacity, Stored>& ma
 template <class Real, int Degree, class Opacity, class Stored, class To>
 SURFCAP_HD void photometric_rays(const Marcher<Real, Degree, Opacity, Stored>& march, const Rays<Real>& rays,
                                  const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin,
-                                 int64_t end, double* losses, Real* color, Real* transmittance, const To& to) {
+                                 int64_t end, double* losses, const Rendering<Real>& out, const To& to) {
   typename Marcher<Real, Degree, Opacity, Stored>::Walk walks[kBundle];
   for (int64_t first = begin; first < end; first += kBundle) {
     const int count = int(smaller<int64_t>(kBundle, end - first));
     for (int r = 0; r < count; ++r) march.start(walks[r], rays, first + r, r);
     for (int r = 0; r < count; ++r) march.finish(walks[r], to.prefetched());
-    for (int r = 0; r < count; ++r)
-      photometric_ray(march, walks[r], rays, seen, loss, first + r, losses, color, transmittance, to);
+    for (int r = 0; r < count; ++r) photometric_ray(march, walks[r], rays, seen, loss, first + r, losses, out, to);
   }
 }
 

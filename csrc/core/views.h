@@ -47,6 +47,13 @@ template <class Real> struct Rays {
   int64_t bundle;                // consecutive rays that share a list of ranges
 };
 
+// Where what rays see is written.
+template <class Real> struct Rendering {
+  Real* color;          // [R, 3]
+  Real* transmittance;  // [R]
+  Real* depth;          // [R] sum of w t / sum of w, world units; NaN where a ray meets nothing
+};
+
 template <class Real> struct RaySettings {
   Real step;        // distance between samples, world units
   Real stop;        // the ray ends when its transmittance has fallen below this; 0: never

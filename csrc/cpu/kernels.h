@@ -13,8 +13,12 @@ template <class Real> struct Kernels {
   void (*sample_forward)(const Field<Real>&, const Real* points, int64_t begin, int64_t end, Real* values);
   void (*sample_backward)(const Field<Real>&, const Real* points, const Real* grad_values, int64_t begin, int64_t end,
                           Real* gradient);
+  void (*shade_forward)(const Field<Real>&, const Real* points, const Real* directions, int64_t begin, int64_t end,
+                        Real* values);
+  void (*shade_backward)(const Field<Real>&, const Real* points, const Real* directions, const Real* grad_values,
+                         int64_t begin, int64_t end, Real* gradient);
   void (*march_forward)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, int64_t begin, int64_t end,
-                        Real* color, Real* transmittance, Real* depth);
+                        const Rendering<Real>& out);
   void (*march_backward)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, const Real* grad_color,
                          const Real* grad_transmittance, const Real* grad_depth, int64_t begin, int64_t end,
                          Real* gradient);
@@ -33,11 +37,11 @@ template <class Real> struct Kernels {
 template <class Real, class Stored, class Sum> struct FitKernels {
   void (*photometric_step)(const Field<Real, Stored>&, const Rays<Real>&, const RaySettings<Real>&,
                            const Observation<Real>&, const PhotometricSettings<Real>&, int64_t begin, int64_t end,
-                           double* losses, Real* color, Real* transmittance, Sum* gradient);
+                           double* losses, const Rendering<Real>& out, Sum* gradient);
   // The slots are Real or, where `narrow`, 8-bit floats.
   void (*photometric_lattice)(const Field<Real, Stored>&, const Rays<Real>&, const RaySettings<Real>&,
                               const Observation<Real>&, const PhotometricSettings<Real>&, const SlotRows<Real>&,
-                              bool narrow, int64_t begin, int64_t end, double* losses, Real* color, Real* transmittance,
+                              bool narrow, int64_t begin, int64_t end, double* losses, const Rendering<Real>& out,
                               void* slots);
   void (*add_sums)(Sum* total, const Sum* more, int64_t begin, int64_t end);
   // Appends the ranges of each ray to `ranges` and writes their number to counts[ray].

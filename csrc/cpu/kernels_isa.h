@@ -63,9 +63,9 @@ void with_marcher(const Field<Real, Stored>& field, const RaySettings<Real>& set
 
 template <class Real>
 void march_forward(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, int64_t begin,
-                   int64_t end, Real* color, Real* transmittance, Real* depth) {
+                   int64_t end, const Rendering<Real>& out) {
   with_marcher(field, settings, [&](const auto& march) {
-    for (int64_t i = begin; i < end; ++i) render_ray(march, rays, i, color, transmittance, depth);
+    for (int64_t i = begin; i < end; ++i) render_ray(march, rays, i, out);
   });
 }
 
@@ -84,11 +84,11 @@ void march_backward(const Field<Real>& field, const Rays<Real>& rays, const RayS
 template <class Real, class Stored, class Sum>
 void photometric_step(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
                       const Observation<Real>& seen, const PhotometricSettings<Real>& loss, int64_t begin, int64_t end,
-                      double* losses, Real* color, Real* transmittance, Sum* gradient) {
+                      double* losses, const Rendering<Real>& out, Sum* gradient) {
   Sum spare[32] = {};
   with_marcher(field, settings, [&]<int Degree, class Opacity>(const Marcher<Real, Degree, Opacity, Stored>& march) {
     const ToVoxels<Real, Degree, Sum> to{gradient, spare};
-    photometric_rays(march, rays, seen, loss, begin, end, losses, color, transmittance, to);
+    photometric_rays(march, rays, seen, loss, begin, end, losses, out, to);
   });
 }
 
@@ -104,12 +104,11 @@ template <class Real, class Stored>
 void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
                          const Observation<Real>& seen, const PhotometricSettings<Real>& loss,
                          const SlotRows<Real>& rows, bool narrow, int64_t begin, int64_t end, double* losses,
-                         Real* color, Real* transmittance, void* slots) {
+                         const Rendering<Real>& out, void* slots) {
   with_slots<Real>(narrow, slots, [&]<class Slot>(const Slot*) {
     const ToSlots<Real, Slot> to{rows, static_cast<Slot*>(slots)};
-    with_marcher(field, settings, [&](const auto& march) {
-      photometric_rays(march, rays, seen, loss, begin, end, losses, color, transmittance, to);
-    });
+    with_marcher(field, settings,
+                 [&](const auto& march) { photometric_rays(march, rays, seen, loss, begin, end, losses, out, to); });
   });
 }
 
@@ -221,6 +220,40 @@ void sample_backward(const Field<Real>& field, const Real* points, const Real* g
   });
 }
 
+// (opacity value, r, g, b) at points seen along directions.
+template <class Real>
+void shade_forward(const Field<Real>& field, const Real* points, const Real* directions, int64_t begin, int64_t end,
+                   Real* values) {
+  with_degree(field.pitch, [&](auto degree) {
+    constexpr int D = decltype(degree)::value;
+    const Code<Real, D, Real> code(field);
+    for_points(field, begin, end, listed(points), [&](const Footprints<Real>& at, int count, int64_t first) {
+      prefetch<D>(field.voxels, at, count);
+      for (int l = 0; l < count; ++l) {
+        const auto weights = basis_weights<Real, D>(directions + 3 * (first + l));
+        store<Real, 4>(values + 4 * (first + l), fold<Real, D>(interpolate(field, code, at, l), weights));
+      }
+    });
+  });
+}
+
+template <class Real>
+void shade_backward(const Field<Real>& field, const Real* points, const Real* directions, const Real* grad_values,
+                    int64_t begin, int64_t end, Real* gradient) {
+  Real spare[32] = {};
+  with_degree(field.pitch, [&](auto degree) {
+    constexpr int D = decltype(degree)::value;
+    for_points(field, begin, end, listed(points), [&](const Footprints<Real>& at, int count, int64_t first) {
+      prefetch<D>(gradient, at, count);
+      for (int l = 0; l < count; ++l) {
+        const auto weights = basis_weights<Real, D>(directions + 3 * (first + l));
+        const auto by_value = load<Real, 4>(grad_values + 4 * (first + l));
+        scatter<Real, D>(gradient, spare, at, l, unfold<Real, D>(by_value, weights));
+      }
+    });
+  });
+}
+
 // The values of the fine tiles begin..end, read from the coarse field at the fine voxels' centres.
 template <class Real>
 void upscale(const Field<Real>& coarse, const Field<Real>& fine, const int32_t* coordinates, int64_t begin, int64_t end,
@@ -268,9 +301,10 @@ void soft_hull(const Silhouettes<Real>& silhouettes, const Real* points, int64_t
 // One initialiser per kind of table.
 template <class Table> struct Filled;
 template <class Real> struct Filled<Kernels<Real>> {
-  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,      sample_forward<Real>, sample_backward<Real>,
-                                       march_forward<Real>,   march_backward<Real>, find_reach<Real>,
-                                       gather_gradient<Real>, soft_hull<Real>,      upscale<Real>};
+  static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,     sample_forward<Real>, sample_backward<Real>,
+                                       shade_forward<Real>,  shade_backward<Real>, march_forward<Real>,
+                                       march_backward<Real>, find_reach<Real>,     gather_gradient<Real>,
+                                       soft_hull<Real>,      upscale<Real>};
 };
 template <class Real, class Stored, class Sum> struct Filled<FitKernels<Real, Stored, Sum>> {
   static constexpr FitKernels<Real, Stored, Sum> table{

@@ -15,15 +15,11 @@ std::tuple<Tensor, Tensor, Tensor> march_forward_typed(const Tensor& voxels, con
   const RaysArgument<Real> rays(origins, directions, shift, background);
   const RaySettings<Real> settings = ray_settings<Real>(opacity, slope, step, stop);
   const int64_t count = rays.view.count;
-  const Tensor color = torch::stable::new_empty(voxels, {count, 3});
-  const Tensor transmittance = torch::stable::new_empty(voxels, {count});
-  const Tensor depth = torch::stable::new_empty(voxels, {count});
-  Real *const c = color.template mutable_data_ptr<Real>(), *const t = transmittance.template mutable_data_ptr<Real>(),
-              *const d = depth.template mutable_data_ptr<Real>();
+  const NewRendering<Real> out(voxels, count);
   parallel_ranges(count, kChunk, [&](int64_t begin, int64_t end) {
-    best_kernels<Real>().march_forward(field.view, rays.view, settings, begin, end, c, t, d);
+    best_kernels<Real>().march_forward(field.view, rays.view, settings, begin, end, out.view);
   });
-  return {color, transmittance, depth};
+  return {out.color, out.transmittance, out.depth};
 }
 
 template <class Real>

@@ -13,9 +13,9 @@ StepResult photometric_lattice_typed(const Tensor& starts, const Tensor& first, 
   const PhotometricArgument<Real, typename Types::Stored> step(common...);
   const SlotRowsArgument<Real> rows(starts, first, exponent, slots, step.rays.view.count);
   void* const to = slots.mutable_data_ptr();
-  const auto work = [&](int64_t begin, int64_t end, double* losses, Real* color, Real* left, Real*) {
+  const auto work = [&](int64_t begin, int64_t end, double* losses, const Rendering<Real>& out, Real*) {
     fit_kernels<Types>().photometric_lattice(step.field.view, step.rays.view, step.settings, step.seen, step.loss,
-                                             rows.view, rows.narrow, begin, end, losses, color, left, to);
+                                             rows.view, rows.narrow, begin, end, losses, out, to);
   };
   const auto nothing = [](Real*, const Real*, int64_t, int64_t) {};
   return photometric(step, kLossGroups, 0, static_cast<Real*>(nullptr), work, nothing);

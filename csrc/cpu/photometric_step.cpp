@@ -17,9 +17,9 @@ StepResult photometric_step_typed(const Tensor& gradients, const Common&... comm
   Sum* const total =
       output<Sum>("gradients", gradients, {groups, field.tiles, kTileSide, kTileSide, kTileSide, field.pitch});
   advise_large_pages(total, groups * size * int64_t(sizeof(Sum)));
-  const auto work = [&](int64_t begin, int64_t end, double* losses, Real* color, Real* left, Sum* buffer) {
+  const auto work = [&](int64_t begin, int64_t end, double* losses, const Rendering<Real>& out, Sum* buffer) {
     fit_kernels<Types>().photometric_step(field, step.rays.view, step.settings, step.seen, step.loss, begin, end,
-                                          losses, color, left, buffer);
+                                          losses, out, buffer);
   };
   return photometric(step, groups, size, total, work, fit_kernels<Types>().add_sums);
 }

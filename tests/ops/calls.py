@@ -17,9 +17,13 @@ from torch_surfcap.reference import TRANSPARENCY
 ops: Any = _ops  # untyped: the tests unpack lists of arguments into its functions
 # Arguments that an op changes in place.
 WRITES = {"photometric_lattice": [20], "gather_gradient": [14], "voxel_terms": [7], "adam_step": [0, 2, 3]}
+# Where, among what an op returns, the rays' transmittance is; their depth follows.
+TRANSMITTANCE = {"march_forward": 1, "photometric_step": 3, "photometric_lattice": 2}
 NAMES = (
     "sample_forward",
     "sample_backward",
+    "shade_forward",
+    "shade_backward",
     "march_forward",
     "march_backward",
     "photometric_step",
@@ -58,6 +62,10 @@ def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
         return [*scene.field, points_of(scene)]
     if name == "sample_backward":
         return [normal(v, rays, count), *scene.field, points_of(scene), GROUPS]
+    if name == "shade_forward":
+        return [*scene.field, points_of(scene), scene.directions]
+    if name == "shade_backward":
+        return [normal(v, rays, 4), *arguments("shade_forward", scene), GROUPS]
     if name == "march_forward":
         return scene.marched(stop)
     if name == "march_backward":
@@ -178,8 +186,9 @@ def run(module: ModuleType, name: str, arguments: Sequence[Any]) -> list[Tensor]
         given[i] = given[i].clone(memory_format=torch.contiguous_format)
     returned = getattr(module, name)(*given)
     outputs = [] if returned is None else [returned] if isinstance(returned, Tensor) else list(returned)
-    if name == "march_forward":
-        outputs[2] = outputs[2].where(has_depth(outputs[1]), 0)
+    if name in TRANSMITTANCE:
+        at = TRANSMITTANCE[name]
+        outputs[at + 1] = outputs[at + 1].where(has_depth(outputs[at]), 0)
     outputs += [given[i] for i in WRITES.get(name, [])]
     if name == "photometric_lattice":
         outputs[-1] = outputs[-1] * reads_voxels(given)[:, None]

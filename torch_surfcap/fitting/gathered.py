@@ -62,9 +62,7 @@ class GatheredGradient:
         """The cameras' shifts [N] for every ray [R]."""
         return shift.repeat_interleave(torch.tensor(self.rays.camera_starts).diff())
 
-    def step(
-        self, arguments: dict[str, Any], shift: Tensor, watch: Stopwatch
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def step(self, arguments: dict[str, Any], shift: Tensor, watch: Stopwatch) -> tuple[Tensor, ...]:
         """What ``ops.photometric_step`` returns, with the gathered gradient [T, 4, 4, 4, P].
 
         Args:
@@ -79,7 +77,7 @@ class GatheredGradient:
             "exponent": self.exponent,
             "slots": self.slots,
         }
-        losses, color, transmittance = ops.photometric_lattice(**arguments, **rows, ranges=self.rays.ranges)
+        losses, *rendering = ops.photometric_lattice(**arguments, **rows, ranges=self.rays.ranges)
         watch.lap("march")
         ops.gather_gradient(
             store,
@@ -96,7 +94,7 @@ class GatheredGradient:
             gradient=self.gradient,
         )
         watch.lap("gather")
-        return losses, self.gradient, color, transmittance
+        return losses, self.gradient, *rendering
 
     def cosines(self, arguments: dict[str, Any]) -> dict[str, float]:
         """Of the angles between the last step's gradient and the exact one, for the opacity value and for colour."""

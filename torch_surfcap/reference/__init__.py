@@ -20,6 +20,8 @@ from .rays import (
     march_backward,
     march_forward,
     photometric_step,
+    shade_backward,
+    shade_forward,
     visibility,
 )
 from .slots import coded, gather_gradient, photometric_lattice
@@ -60,6 +62,8 @@ __all__ = [
     "photometric_step",
     "sample_backward",
     "sample_forward",
+    "shade_backward",
+    "shade_forward",
     "soft_hull",
     "upscale",
     "visibility",

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .codes import decoded
-from .store import TILE, corners, dense, dense_index, nonempty_cells
+from .store import TILE, corners, dense, dense_index, nonempty_cells, sample_forward
 from .voxels import huber_norm
 
 TRANSPARENCY, DISTANCE = 0, 1  # what the first coefficient of a voxel means
@@ -41,6 +41,14 @@ def harmonics(directions: Tensor, count: int) -> Tensor:
     return torch.stack(functions[:count], -1)
 
 
+def shaded(records: Tensor, directions: Tensor) -> Tensor:
+    """Records [...,P] seen along unit directions [...,3]: [...,4] opacity value, r, g, b."""
+    basis = BASIS_OF_PITCH[records.shape[-1]]
+    coefficients = records[..., 1 : 1 + 3 * basis].unflatten(-1, (basis, 3))
+    color = (harmonics(directions, basis)[..., None] * coefficients).sum(-2)
+    return torch.cat([records[..., :1], color], -1)
+
+
 class March(NamedTuple):
     """Samples of R rays on a lattice of K distances; after a ray's end and in empty cells a = 1."""
 
@@ -61,6 +69,13 @@ class March(NamedTuple):
     def value(self) -> Tensor:
         """[R,K] opacity value."""
         return self.read[..., 0]
+
+    @property
+    def depth(self) -> Tensor:
+        """[R], NaN where a ray meets nothing."""
+        total = self.weight.sum(1)
+        solid = total > NOTHING[total.dtype]
+        return torch.where(solid, (self.weight * self.t).sum(1) / torch.where(solid, total, 1), math.nan)
 
 
 def march(
@@ -90,10 +105,7 @@ def march(
     )
 
     record = (dense(decoded(voxels, frame), table, frame)[index.unbind(-1)] * corner[..., None]).sum(-2)
-    basis = BASIS_OF_PITCH[voxels.shape[-1]]
-    coefficients = record[..., 1 : 1 + 3 * basis].unflatten(-1, (basis, 3))
-    color = torch.einsum("rl,rklc->rkc", harmonics(directions, basis), coefficients)
-    read = torch.cat([record[..., :1], color], -1)
+    read = shaded(record, directions[:, None])
     value, color = read[..., 0], read[..., 1:]
     if opacity == TRANSPARENCY:
         a = value
@@ -113,6 +125,27 @@ def march(
     a = torch.where(alive, a, 1)
     transmittance = torch.cat([a.new_ones(len(a), 1), torch.cumprod(a, 1)], 1)
     return March(t, read, a, color, transmittance, active & alive, index, corner)
+
+
+def shade_forward(
+    voxels: Tensor, table: Tensor, frame: Sequence[float], points: Tensor, directions: Tensor
+) -> Tensor:
+    """Opacity value and colour [N,4] at points [N,3] (world) seen along unit directions [N,3]."""
+    return shaded(sample_forward(voxels, table, frame, points), directions)
+
+
+def shade_backward(
+    grad_values: Tensor,
+    voxels: Tensor,
+    table: Tensor,
+    frame: Sequence[float],
+    points: Tensor,
+    directions: Tensor,
+    groups: int = 1,
+) -> Tensor:
+    """The adjoint of `shade_forward`: [N,4] -> [T,4,4,4,P]."""
+    leaf = voxels.detach().requires_grad_()
+    return torch.autograd.grad(shade_forward(leaf, table, frame, points, directions), leaf, grad_values)[0]
 
 
 def march_forward(
@@ -136,10 +169,7 @@ def march_forward(
     """
     m = march(voxels, table, frame, origins, directions, shift, opacity, slope, step, stop)
     left = m.transmittance[:, -1]
-    total = m.weight.sum(1)
-    solid = total > NOTHING[voxels.dtype]
-    depth = torch.where(solid, (m.weight * m.t).sum(1) / torch.where(solid, total, 1), math.nan)
-    return (m.weight[..., None] * m.color).sum(1) + left[:, None] * background, left, depth
+    return (m.weight[..., None] * m.color).sum(1) + left[:, None] * background, left, m.depth
 
 
 def march_backward(
@@ -192,9 +222,9 @@ def photometric_step(
     gradients: Tensor | None = None,
     rendered_sample: bool = False,
     bundle: int = 1,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Losses [3] (photo, sample: eq. 10, mask), gradient of weights · losses, colour [R,3], transmittance
-    [R].
+    [R] and depth [R].
 
     target [R,3] observed colour, mask [R] 1 = subject, weight [R] of the ray in every loss. `ranges` and
     `gradients`, which save the compiled op a search and memory, are not looked at.
@@ -205,7 +235,7 @@ def photometric_step(
         m, background, target, mask, weight, huber, detach_sample, rendered_sample
     )
     (gradient,) = torch.autograd.grad((losses * losses.new_tensor(weights)).sum(), leaf)
-    return losses.detach().double(), gradient, color.detach(), left.detach()
+    return losses.detach().double(), gradient, color.detach(), left.detach(), m.depth.detach()
 
 
 def ray_losses(

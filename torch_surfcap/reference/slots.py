@@ -37,8 +37,8 @@ def photometric_lattice(
     ranges: tuple[Tensor, Tensor] | None = None,
     rendered_sample: bool = False,
     bundle: int = 1,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Losses [3], colour [R,3], transmittance [R] as `photometric_step` gives them; writes `slots` [S,4].
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Losses [3], colour [R,3], transmittance [R], depth [R] as `photometric_step` gives them; writes `slots` [S,4].
 
     Slot starts[r] + i gets 2^exponent times the gradient of weights · losses by what sample first[r] + i of ray r
     read, (opacity value, r, g, b); uint8 stands for torch.float8_e5m2.
@@ -55,7 +55,7 @@ def photometric_lattice(
         k = torch.arange(low, low + end - begin)
         exists = (k >= 0) & (k < by_read.shape[1])
         slots[begin:end][exists] = coded(by_read[ray, k[exists]] * 2.0**exponent, slots.dtype)
-    return losses.detach().double(), color.detach(), left.detach()
+    return losses.detach().double(), color.detach(), left.detach(), m.depth.detach()
 
 
 def coded(values: Tensor, dtype: torch.dtype) -> Tensor:
