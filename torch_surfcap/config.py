@@ -22,7 +22,14 @@ from torch_surfcap.data.files import atomic_write
 from torch_surfcap.data.readers import FORMATS
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import MISSING
-from torch_surfcap.fitting.settings import CHOICES, LOSSES, SAMPLE_TARGETS, VISITS, FitSettings
+from torch_surfcap.fitting.settings import (
+    CHOICES,
+    LOSSES,
+    SAMPLE_TARGETS,
+    VIEW_SPACINGS,
+    VISITS,
+    FitSettings,
+)
 
 
 def _one_of(default: Any, *values: Any) -> Any:
@@ -59,6 +66,8 @@ class LossesConfig:
     parsimony: float | None = _within(None, 0)  # weight of Huber's norm of the view-dependent coefficients
     ballooning: float | None = _within(None, 0)  # weight of the squared opacity value
     curvature: float | None = _within(None, 0)  # weight of the bending of the opacity value
+    bend: float | None = _within(None, 1e-6)  # Laplacian, voxels^-1, above which bending costs linearly
+    coarse_curvature: float | None = _within(None, 0)  # share of the weight before the last level
     detach_sample: bool | None = None  # the sample loss moves colours only
     sample_target: str | None = _one_of(None, *SAMPLE_TARGETS)  # what samples are held against
     anneal: bool | None = None  # ballooning falls with the rates towards the end of a level
@@ -99,6 +108,7 @@ class Config:
     device: str = _one_of("auto", "auto", "cpu", "cuda")
     seed: int = _within(0, 0)
     sh_degree: int | None = _one_of(None, 0, 1, 2)  # of the colour's dependence on the direction of view
+    view_spacing: int = _one_of(1, *VIEW_SPACINGS)  # voxels between the nodes of view-dependent coefficients
     voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
     opacity: str | None = _one_of(None, *LOSSES)  # what a voxel stores
@@ -175,6 +185,7 @@ def fit_arguments(config: Config) -> dict[str, Any]:
     arguments = {
         "opacity": config.opacity,
         "sh_degree": config.sh_degree,
+        "view_spacing": config.view_spacing,
         "voxel": config.voxel,
         "levels": config.levels,
         "gains": config.gains,

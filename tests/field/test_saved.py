@@ -65,7 +65,7 @@ def test_contradictory_files_are_refused(tmp_path: Path) -> None:
         "voxels: expected": {"voxels": content["voxels"][1:]},
         "voxel_size: expected": {"voxel_size": np.float64(-1.0)},
         "opacity: expected": {"opacity": np.str_("alpha")},
-        "format 1, expected 2": {"format": np.int64(1)},
+        "format 1, expected 3": {"format": np.int64(1)},
         "step: expected": {"step": np.float64(-1.0)},
         "not enough values": {"origin": content["origin"][:2]},
     }

@@ -17,5 +17,5 @@ def begun(capture: Capture, voxel: float, iterations: int, **given: Any) -> tupl
     box = subject_box(capture, None)
     plan = [replace(plan_levels(capture, box, voxel, 1)[0], iterations=iterations)]
     studio = open_studio(capture, settings, 0)
-    grid, store = first_field(capture, box, voxel, settings, 1)
+    grid, store = first_field(capture, box, voxel, settings)
     return begin_stage(settings, plan, 0, grid, store, studio), studio, settings

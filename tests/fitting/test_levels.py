@@ -56,7 +56,7 @@ def test_box_as_given() -> None:
 def test_first_field_holds_the_ball(opacity: str, degree: int) -> None:
     """Its surface lies outside the ball, by little more than the pixel and the voxel that the hull is widened by."""
     capture, voxel = ball(), 0.03
-    grid, store = first_field(capture, BOX, voxel, FitSettings.of(opacity=opacity), degree)
+    grid, store = first_field(capture, BOX, voxel, FitSettings.of(opacity=opacity, sh_degree=degree))
     assert store.shape == (len(grid.coords), 4, 4, 4, ops.pitch(degree))
     field = SurfaceField(store, grid, opacity)
     radius = (voxel_centers(grid) - center).norm(dim=-1)
@@ -80,7 +80,7 @@ def test_a_transparency_that_falls_off_from_the_hull() -> None:
     """Clear at the hull's surface, and a fiftieth less for every voxel below it."""
     capture, voxel = ball(), 0.03
     settings = FitSettings.of(opacity="transparency", start="hull")
-    grid, store = first_field(capture, BOX, voxel, settings, 0)
+    grid, store = first_field(capture, BOX, voxel, settings)
     field = SurfaceField(store, grid, "transparency")
     depths = torch.tensor([0.0, 3.0, 6.0])[:, None] * voxel
     along = torch.tensor([[RADIUS, 0.0, 0.0]]) - depths * torch.tensor([[1.0, 0.0, 0.0]])
@@ -110,13 +110,13 @@ def test_a_box_of_too_many_voxels() -> None:
     with pytest.raises(
         InputError, match=r"memory: the first level \(voxels of 1e-07\) needs .* GiB are free"
     ):
-        first_field(ball(6, 16), BOX, 1e-7, FitSettings.of(opacity="distance"), 0)
+        first_field(ball(6, 16), BOX, 1e-7, FitSettings.of(opacity="distance"))
 
 
 def test_nothing_in_the_box() -> None:
     far = (center + 5, center + 6)
     with pytest.raises(InputError, match="silhouettes: the visual hull is empty inside the box"):
-        first_field(ball(6, 16), far, 0.1, FitSettings.of(opacity="distance"), 0)
+        first_field(ball(6, 16), far, 0.1, FitSettings.of(opacity="distance"))
 
 
 def plane() -> tuple[TileGrid, Tensor, Tensor, float]:
@@ -185,7 +185,7 @@ def test_first_field_has_no_phantoms() -> None:
     """In the margin and the last tiles around the box few cameras look: nothing may start there."""
     capture, voxel = ball(side=48), 1 / 24
     grid, store = first_field(
-        capture, subject_box(capture, None), voxel, FitSettings.of(opacity="transparency"), 0
+        capture, subject_box(capture, None), voxel, FitSettings.of(opacity="transparency")
     )
     reach = ((voxel_centers(grid) - center).norm(dim=-1) - RADIUS)[store[..., 0] < 0.99]
     assert reach.max() < 4 * voxel
@@ -221,7 +221,7 @@ def test_next_level_of_a_transparency() -> None:
     """Tiles where samples have weight; what no light reaches is solid, what it passes is dropped."""
     capture, voxel = ball(side=32), 0.04
     grid, store = first_field(
-        capture, (center - 0.3, center + 0.3), voxel, FitSettings.of(opacity="transparency"), 0
+        capture, (center - 0.3, center + 0.3), voxel, FitSettings.of(opacity="transparency", sh_degree=0)
     )
     radius = (voxel_centers(grid) - center).norm(dim=-1)
     store[..., 0] = torch.where(radius < RADIUS, ETA, 1.0)

@@ -31,7 +31,7 @@ OPACITIES = ("transparency", "distance")
 
 def fitted(opacity: str, capture: Capture) -> tuple[TileGrid, Tensor, March]:
     """A field that holds the ball as a fit would leave it, with noise in its colours."""
-    grid, store = first_field(capture, BOX, VOXEL, FitSettings.of(opacity=opacity), 1)
+    grid, store = first_field(capture, BOX, VOXEL, FitSettings.of(opacity=opacity))
     g = torch.Generator().manual_seed(0)
     away = ((voxel_centers(grid) - center).norm(dim=-1) - RADIUS) / VOXEL
     store[..., 0] = (away.clamp(-4, 4) if opacity == "distance" else 0.81 + 0.3 * away).clamp(

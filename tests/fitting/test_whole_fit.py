@@ -122,8 +122,8 @@ def test_budget_grows_with_levels_and_degree() -> None:
     plan = plan_levels(capture, box, 0.05, 3)
     bytes_by_degree = []
     for degree in (0, 1, 2):
-        settings = FitSettings()
-        grid, store = first_field(capture, box, plan[0].voxel_size, settings, degree)
+        settings = FitSettings.of(sh_degree=degree)
+        grid, store = first_field(capture, box, plan[0].voxel_size, settings)
         budget = estimate(capture, plan, grid, store, settings)
         assert budget.level_bytes == sorted(budget.level_bytes)
         assert budget.level_bytes[0] > 4 * 3 * store.numel()

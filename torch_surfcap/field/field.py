@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import zipfile
 import zlib
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torch_surfcap import ops
-from torch_surfcap.autograd import March, MarchRays, SampleTiles
+from torch_surfcap.autograd import March, MarchRays, SampleTiles, ShadePoints
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.tiles import TileGrid, with_skips
@@ -26,7 +27,8 @@ SLOPE = 4.0  # per voxel, of the signed distance's logistic
 LEVEL = {"transparency": 0.81, "distance": 0.0}  # value on the surface, of a path of a voxel's diagonal
 DIAGONAL = 3.0**0.5  # of a voxel, in voxels
 MISSING = {"transparency": (1.0, ETA), "distance": (CLAMP, -CLAMP)}  # value outside, inside
-FORMAT = 2  # of the .npz file
+FORMAT = 3  # of the .npz file
+VIEW_PREFIX = "view_"
 
 
 class RayOutput(NamedTuple):
@@ -46,6 +48,8 @@ class SurfaceField(nn.Module):
         opacity: "transparency" (1 = empty) or "distance" (signed, in voxels, positive outside).
         sh_degree: 0, 1 or 2.
         step: voxels between the samples of a ray: a transparency is that of a path of this length.
+        view: another field, or None: its colour, read once per ray at the mean depth, is added to what the ray sees. A fit
+            keeps view-dependent colours in one of larger voxels where ``view_spacing`` is more than 1.
         level: opacity value on the surface. A path of a voxel's diagonal has transparency 0.81 there, shorter ones more.
 
     >>> grid = torch.ones(8, 8, 8); grid[2:6, 2:6, 2:6] = 0.01
@@ -56,7 +60,12 @@ class SurfaceField(nn.Module):
     """
 
     def __init__(
-        self, voxels: Tensor, grid: TileGrid, opacity: str = "transparency", step: float = DIAGONAL
+        self,
+        voxels: Tensor,
+        grid: TileGrid,
+        opacity: str = "transparency",
+        step: float = DIAGONAL,
+        view: SurfaceField | None = None,
     ) -> None:
         super().__init__()
         if not 0 < step < float("inf"):
@@ -75,6 +84,7 @@ class SurfaceField(nn.Module):
         self.voxel_size = grid.voxel_size
         self.outside, self.inside = MISSING[opacity]
         self.step = step
+        self.view = view
         self.level = LEVEL[opacity] ** (step / DIAGONAL)  # a path's transparency is a power of its length
         self.table: Tensor
         self.tile_coords: Tensor
@@ -156,7 +166,7 @@ class SurfaceField(nn.Module):
         shift: Tensor | None = None,
         step: float | None = None,
     ) -> RayOutput:
-        """The ray integral (paper eq. 6).
+        """The ray integral (paper eq. 6), and (1 - T) times the colour of ``view`` at the depth, which counts as a constant.
 
         Args:
             origins, directions: [R, 3], world; directions are unit vectors. background: [R, 3], black by default.
@@ -176,11 +186,16 @@ class SurfaceField(nn.Module):
         color, transmittance, depth = MarchRays.apply(
             store, background.to(device, dtype), self.table, self._frame, *rays, self.march(step)
         )
+        if self.view is not None:
+            points = origins + depth.detach().nan_to_num(0.0)[:, None] * directions
+            color = color + (1 - transmittance)[:, None] * self.view.sample(points, directions)[1]
         return RayOutput(color, transmittance, depth)
 
     def sample_opacity(self, points: Tensor) -> Tensor:
         """The raw opacity value at ``points [P, 3]``: [P], differentiable."""
-        return self._read(points)[:, 0]
+        points = points.to(self.voxels.device, self.voxels.dtype)
+        values: Tensor = SampleTiles.apply(self._store(), self.table, self._frame, points)
+        return values[:, 0]
 
     def sample(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         """Transparency [P] and colour [P, 3] at ``points [P, 3]`` seen along unit ``directions [P, 3]``.
@@ -188,19 +203,14 @@ class SurfaceField(nn.Module):
         The transparency of a signed distance s is that of a long step that ends there, 1/(1 + exp(-slope s)): 1 outside,
         0 inside. Differentiability: voxels.
         """
-        values = self._read(points)
-        opacity = values[:, 0]
+        points, directions = (x.to(self.voxels.device, self.voxels.dtype) for x in (points, directions))
+        values = ShadePoints.apply(self._store(), self.table, self._frame, points, directions)
+        opacity, color = values[:, 0], values[:, 1:]
         if self.opacity == "distance":
             opacity = torch.sigmoid(SLOPE * opacity)
-        count = (self.sh_degree + 1) ** 2
-        weights = sh_basis(directions.to(values), self.sh_degree)
-        sh = values[:, 1 : 1 + 3 * count].unflatten(-1, (count, 3))
-        return opacity, (weights[:, :, None] * sh).sum(1)
-
-    def _read(self, points: Tensor) -> Tensor:
-        points = points.to(self.voxels.device, self.voxels.dtype)
-        values: Tensor = SampleTiles.apply(self._store(), self.table, self._frame, points)
-        return values
+        if self.view is not None:
+            color = color + self.view.sample(points, directions)[1]
+        return opacity, color
 
     def _store(self) -> Tensor:
         """The parameter as the ops want it: padded records. The memory behind it, where that still is padded."""
@@ -226,8 +236,12 @@ class SurfaceField(nn.Module):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz file (complete or absent, no pickle)."""
+        with atomic_write(path) as partial, open(partial, "wb") as file:
+            np.savez(file, format=np.int64(FORMAT), **self._arrays())
+
+    def _arrays(self) -> dict[str, Any]:
+        """What is saved, by name; what is the view's has a prefix."""
         data = {
-            "format": np.int64(FORMAT),
             "voxels": self.voxels.detach().cpu().numpy(),
             "table": torch.clamp(self.table, min=ops.OUTSIDE).cpu().numpy(),
             "tile_coords": self.tile_coords.cpu().numpy(),
@@ -236,8 +250,8 @@ class SurfaceField(nn.Module):
             "opacity": np.str_(self.opacity),
             "step": np.float64(self.step),
         }
-        with atomic_write(path) as partial, open(partial, "wb") as file:
-            np.savez(file, **data)
+        view = {} if self.view is None else self.view._arrays()
+        return data | {VIEW_PREFIX + name: value for name, value in view.items()}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SurfaceField:
@@ -247,10 +261,7 @@ class SurfaceField(nn.Module):
             with np.load(path, allow_pickle=False) as data:
                 if int(data["format"]) != FORMAT:
                     raise InputError(f"{path}: field format {int(data['format'])}, expected {FORMAT}")
-                x, y, z = (float(c) for c in data["origin"])
-                table, coords = torch.from_numpy(data["table"]), torch.from_numpy(data["tile_coords"])
-                grid = TileGrid(with_skips(table), coords, (x, y, z), float(data["voxel_size"]))
-                return cls(torch.from_numpy(data["voxels"]), grid, str(data["opacity"]), float(data["step"]))
+                return cls._of({name: data[name] for name in data.files})
         except InputError:
             raise
         except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -258,13 +269,12 @@ class SurfaceField(nn.Module):
         except (zipfile.BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: a damaged file ({error}), {expected}") from error
 
-
-def sh_basis(directions: Tensor, sh_degree: int) -> Tensor:
-    """The basis 1, y, z, x, xy, yz, (3 z^2 - 1)/2, xz, (x^2 - y^2)/2 at unit directions [P, 3]: [P, (B + 1)^2]."""
-    x, y, z = directions.unbind(-1)
-    basis = [torch.ones_like(x)]
-    if sh_degree >= 1:
-        basis += [y, z, x]
-    if sh_degree >= 2:
-        basis += [x * y, y * z, 0.5 * (3 * z * z - 1), x * z, 0.5 * (x * x - y * y)]
-    return torch.stack(basis, -1)
+    @classmethod
+    def _of(cls, data: Mapping[str, Any]) -> SurfaceField:
+        """The field of what :meth:`_arrays` gave."""
+        view = {name.removeprefix(VIEW_PREFIX): data[name] for name in data if name.startswith(VIEW_PREFIX)}
+        x, y, z = (float(c) for c in data["origin"])
+        table, coords = torch.from_numpy(data["table"]), torch.from_numpy(data["tile_coords"])
+        grid = TileGrid(with_skips(table), coords, (x, y, z), float(data["voxel_size"]))
+        kind, step = str(data["opacity"]), float(data["step"])
+        return cls(torch.from_numpy(data["voxels"]), grid, kind, step, cls._of(view) if view else None)

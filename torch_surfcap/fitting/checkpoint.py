@@ -22,12 +22,14 @@ from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting import view_color
 from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.levels import Level
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.rays import rays_of
 from torch_surfcap.fitting.settings import FitSettings
 from torch_surfcap.fitting.stage import Stage, Studio, begin_adam, march_of
+from torch_surfcap.fitting.view_color import ViewColor
 from torch_surfcap.version import VERSION
 
 
@@ -95,7 +97,18 @@ class Saved:
             plain["moved"],
             plain["compared"],
             plain["seconds"],
+            self._view(arrays, settings),
         )
+
+    def _view(self, arrays: dict[str, Tensor], settings: FitSettings) -> ViewColor | None:
+        """The view-dependent colour, where it is on a grid of its own."""
+        if "view_store" not in arrays:
+            return None
+        x, y, z = self.plain["view_origin"]
+        grid = TileGrid(arrays["view_table"], arrays["view_coords"], (x, y, z), self.plain["view_voxel_size"])
+        adam = view_color.begin_adam(arrays["view_store"], settings)
+        adam.first, adam.second, adam.t = arrays["view_first"], arrays["view_second"], self.plain["t"]
+        return ViewColor(grid, arrays["view_store"], adam, arrays["view_depth"])
 
 
 @dataclass
@@ -157,6 +170,17 @@ class Checkpoints:
             "gain": studio.exposure.gain,
             "bias": studio.exposure.bias,
         }
+        if stage.view:
+            view = stage.view
+            plain |= {"view_origin": view.grid.origin, "view_voxel_size": view.grid.voxel_size}
+            arrays |= {
+                "view_store": view.store,
+                "view_first": view.adam.first,
+                "view_second": view.adam.second,
+                "view_table": view.grid.table,
+                "view_coords": view.grid.coords,
+                "view_depth": view.depth,
+            }
         data: dict[str, Any] = {name: array.numpy() for name, array in arrays.items()}
         data["plain"] = np.frombuffer(json.dumps(plain).encode(), dtype=np.uint8)
         with atomic_write(self.path) as partial, open(partial, "wb") as file:

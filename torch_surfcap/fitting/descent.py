@@ -11,19 +11,15 @@ from torch_surfcap import ops
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.fitting.budget import partial_gradients
 from torch_surfcap.fitting.gathered import GatheredGradient
-from torch_surfcap.fitting.settings import FitSettings
+from torch_surfcap.fitting.settings import PARSIMONY_HUBER, FitSettings
 from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio
 
 REFRESH = 8.0  # iterations at full rate after which the integration ranges are found anew: less than a voxel of motion
-PARSIMONY_HUBER = 0.1
-BEND = (
-    0.4  # voxels^-1, the sum of curvatures above which bending costs linearly: edges and thin parts survive
-)
 
 RAY_ARGUMENTS = ("origins", "directions", "background", "target", "mask", "weight")
 RAY_LOSSES = ("photo", "sample", "mask")
 VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature")
-BALLOONING = VOXEL_LOSSES.index("ballooning")
+BALLOONING, CURVATURE = (VOXEL_LOSSES.index(name) for name in ("ballooning", "curvature"))
 GAINS_EVERY = 5  # iterations between two fits of the cameras' gains
 FIRST_GAINS = 10  # iterations before the first: until then the field is grey and says nothing
 
@@ -35,7 +31,9 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     ray_weights, voxel_weights = (
         [getattr(loss, name) for name in names] for names in (RAY_LOSSES, VOXEL_LOSSES)
     )
-    store, grid, rays, rule = stage.store, stage.grid, stage.rays, stage.rule
+    if stage.level.halvings > 0:
+        voxel_weights[CURVATURE] *= loss.coarse_curvature
+    store, grid, rays, rule, view = stage.store, stage.grid, stage.rays, stage.rule, stage.view
     frame = grid.frame(*MISSING[settings.opacity])
     arguments: dict[str, Any] = {
         "voxels": store,
@@ -63,22 +61,30 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
             watch.lap("ranges")
         lattices = len(rays.cameras) if gathered else len(rays)
         shift = (torch.rand(lattices, generator=studio.generator) - 0.5) * settings.descent.jitter
+        if view:
+            offset = view.seen_by(rays)
+            arguments |= {"target": rays.target - offset, "background": rays.background - offset}
         arguments["shift"] = gathered.per_ray(shift) if gathered else shift
         cosines: dict[str, float] = {}
         if gathered:
-            ray_losses, gradient, color, transmittance = gathered.step(arguments, shift, watch)
+            ray_losses, gradient, color, transmittance, depth = gathered.step(arguments, shift, watch)
             if rule.scale != stage.compared:
                 cosines, stage.compared = gathered.cosines(arguments), rule.scale
                 watch.lap("compare")
         else:
-            ray_losses, gradient, color, transmittance = ops.photometric_step(
+            ray_losses, gradient, color, transmittance, depth = ops.photometric_step(
                 **arguments, ranges=rays.ranges, gradients=gradients
             )
             watch.lap("march")
+        if view:
+            residual = color - arguments["target"]
+            view.step(rays, residual, transmittance, depth, loss, rule.scale)
+            color += offset
+            watch.lap("view")
         if loss.anneal:  # the bias helps to find a surface, and then stands in its way
             voxel_weights[BALLOONING] = loss.ballooning * rule.scale
         voxel_losses = ops.voxel_terms(
-            store, grid.table, frame, grid.places, voxel_weights, PARSIMONY_HUBER, BEND, gradient
+            store, grid.table, frame, grid.places, voxel_weights, PARSIMONY_HUBER, loss.bend, gradient
         )
         watch.lap("voxels")
         stage.adam.step(gradient, rule.scale)

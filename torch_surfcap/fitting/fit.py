@@ -24,8 +24,6 @@ from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio, begin_stage, n
 if TYPE_CHECKING:
     import trimesh
 
-DEFAULT_DEGREE = 1
-
 
 @dataclass
 class FitResult:
@@ -100,7 +98,6 @@ def fit(
     saved = None if checkpoints is None else checkpoints.load()
     if saved is not None and checkpoints is not None:
         checkpoints.check(saved, s, capture)
-    degree = DEFAULT_DEGREE if s.sh_degree is None else s.sh_degree
     box = subject_box(capture, s.box) if saved is None else saved.box
     plan = plan_levels(capture, box, s.voxel, s.levels)
     watch.lap("box")
@@ -109,7 +106,7 @@ def fit(
     studio = open_studio(capture, s, plan[0].halvings, floor)
     so_far = Record(list(capture.warnings))
     if saved is None:
-        grid, store = first_field(studio.pictures[-1], box, plan[0].voxel_size, s, degree, floor)
+        grid, store = first_field(studio.pictures[-1], box, plan[0].voxel_size, s, floor)
         watch.lap("hull")
         budget = estimate(capture, plan, grid, store, s)
         so_far.level_bytes = budget.level_bytes
@@ -141,7 +138,8 @@ def fit(
             checkpoints.save(s, capture, box, stage, studio, so_far)
     watch.lap("fit")
     step = stage.march.step / stage.grid.voxel_size
-    surface = SurfaceField(stage.decoded(s.opacity, floor), stage.grid, s.opacity, step)
+    view = stage.view and stage.view.field()
+    surface = SurfaceField(stage.decoded(s.opacity, floor), stage.grid, s.opacity, step, view)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:
@@ -153,7 +151,7 @@ def fit(
         so_far.history,
         studio.exposure.gain,
         studio.exposure.bias,
-        _chosen(s, degree, box, stage, plan, studio),
+        _chosen(s, box, stage, plan, studio),
         seconds,
         so_far.warnings,
         None if saved is None else saved.place,
@@ -170,12 +168,12 @@ def short_of(plan: list[Level], number: int, level_bytes: list[int]) -> str | No
 
 
 def _chosen(
-    s: FitSettings, degree: int, box: tuple[Tensor, Tensor], stage: Stage, plan: list[Level], studio: Studio
+    s: FitSettings, box: tuple[Tensor, Tensor], stage: Stage, plan: list[Level], studio: Studio
 ) -> dict[str, Any]:
     """What the fit chose, and why."""
     cut = "memory" if stage.number < len(plan) - 1 else None
     return {
-        "sh_degree": {"value": degree, "reason": "default" if s.sh_degree is None else "given"},
+        "sh_degree": {"value": s.degree, "reason": "default" if s.sh_degree is None else "given"},
         "voxel": {
             "value": stage.grid.voxel_size,
             "reason": cut or ("a pixel's footprint" if s.voxel is None else "given"),

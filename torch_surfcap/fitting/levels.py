@@ -77,7 +77,6 @@ def first_field(
     box: tuple[Tensor, Tensor],
     voxel_size: float,
     settings: FitSettings,
-    sh_degree: int,
     floor: Floor | None = None,
 ) -> tuple[TileGrid, Tensor]:
     """Grid and padded records [T, 4, 4, 4, P] of the coarsest level, out of the soft hull.
@@ -116,7 +115,7 @@ def first_field(
     grid = TileGrid.build(stored & ~deep, deep, (x, y, z), voxel_size)
     tiles = value.reshape(size[0], 4, size[1], 4, size[2], 4).permute(0, 2, 4, 1, 3, 5)
     i, j, k = grid.coords.long().unbind(1)
-    store = torch.zeros(len(grid.coords), 4, 4, 4, ops.pitch(sh_degree))
+    store = torch.zeros(len(grid.coords), 4, 4, 4, ops.pitch(settings.voxel_degree))
     store[..., 0] = tiles[i, j, k]
     store[..., 1:4] = 0.5
     return grid, store

@@ -15,16 +15,18 @@ class Losses:
     serves every level, image size and number of cameras."""
 
     photo: float = 1.0  # Huber(colour - photograph), eq. 8
-    sample: float = 0.3  # each sample's own colour against the photograph, eq. 10
+    sample: float = 0.1  # each sample's own colour against the photograph, eq. 10
     mask: float | None = (
         None  # (transmittance - (1 - mask))^2; by default what suits the silhouettes, see MASK
     )
     huber: float = 0.1  # colour difference above which Huber's norm is linear
     tv_opacity: float = 3e-5  # squared steps of the opacity value, eq. 9
-    tv_color: float = 1e-3  # squared steps of the colour coefficients
+    tv_color: float = 6e-4  # squared steps of the colour coefficients
     parsimony: float = 1e-3  # Huber norm of the view-dependent coefficients, eq. 11
     ballooning: float = 0.0  # squared opacity value, eq. 12
     curvature: float = 1e-4  # Huber norm of the Laplacian of the opacity value
+    bend: float = 0.8  # Laplacian, voxels^-1, above which it is linear: edges and thin parts survive
+    coarse_curvature: float = 0.5  # share of the curvature's weight on the levels before the last
     detach_sample: bool = False  # the sample loss moves colours only
     sample_target: str = "observed"  # or "rendered": the ray's colour that samples are held against
     anneal: bool = False  # ballooning falls with the rates towards the end of a level
@@ -49,19 +51,25 @@ class Descent:
 
 LOSSES = {
     "distance": Losses(),
-    "transparency": Losses(sample=0.5, tv_opacity=4e-5, tv_color=1e-4, curvature=1e-3),
+    "transparency": Losses(
+        sample=0.5, tv_opacity=4e-5, tv_color=1e-4, curvature=1e-3, bend=0.4, coarse_curvature=1.0
+    ),
 }
 # Weight of the mask loss. Silhouettes that were found by plates err where subject and room look alike, and with plates
 # the colours themselves say what is empty.
 MASK = {"distance": 0.3, "transparency": 0.05}
 MASK_BY_PLATES = 0.03
 DESCENT = {
-    "distance": Descent(),
+    "distance": Descent(last_step=0.7),
     # Shorter steps give a transparency a sharper surface, which holds on to concave parts.
     "transparency": Descent(rate_opacity=0.12, last_step=1.0),
 }
 # Rounds of Taubin smoothing: a transparency falls within a voxel, so that its surface is a staircase.
 SMOOTH = {"distance": 5, "transparency": 120}
+
+DEFAULT_DEGREE = 1
+PARSIMONY_HUBER = 0.1  # view-dependent coefficient above which it costs linearly
+VIEW_SPACINGS = (1, 4, 8)
 
 CHOICES = {
     "gains": ("auto", "on", "off"),
@@ -80,6 +88,8 @@ class FitSettings:
 
     opacity:   "distance" or "transparency", what a voxel stores
     sh_degree: 0, 1, 2, of the colour's dependence on the direction of view
+    view_spacing: voxels between the nodes that the view-dependent coefficients stand at: 1, in every voxel; 4 or 8, on a
+               coarser grid that is read once per ray (see ``torch_surfcap.fitting.view_color``)
     voxel:     edge of the finest voxels, world units; a pixel's footprint by default
     levels:    number of resolutions; by default as many, up to 4, as the pictures can be halved
     box:       (x0, y0, z0, x1, y1, z1) around the subject; found by default
@@ -105,6 +115,7 @@ class FitSettings:
 
     opacity: str = "distance"
     sh_degree: int | None = None
+    view_spacing: int = 1
     voxel: float | None = None
     levels: int | None = None
     box: tuple[float, ...] | None = None
@@ -125,6 +136,16 @@ class FitSettings:
     accumulator: int = 32
     losses: Losses = field(default_factory=Losses)
     descent: Descent = field(default_factory=Descent)
+
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics."""
+        return DEFAULT_DEGREE if self.sh_degree is None else self.sh_degree
+
+    @property
+    def voxel_degree(self) -> int:
+        """The same of the voxels' own records."""
+        return self.degree if self.view_spacing == 1 else 0
 
     def suited(self, mask_source: str | None) -> FitSettings:
         """The settings with the mask's weight that suits where a capture's silhouettes are from."""
@@ -155,6 +176,7 @@ class FitSettings:
         may_halve = settings.storage < 32 and settings.gradient == "scatter"
         for name, sound in (
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
+            ("view_spacing", settings.view_spacing in VIEW_SPACINGS),
             ("voxel", settings.voxel is None or settings.voxel > 0),
             ("storage", settings.storage in (32, 16, 8)),
             ("rounding", settings.rounding in ("stochastic", "nearest")),

@@ -20,6 +20,7 @@ from torch_surfcap.fitting.levels import Level, cut_at_floor, next_level
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, gather_rays
 from torch_surfcap.fitting.settings import FitSettings
+from torch_surfcap.fitting.view_color import ViewColor, begin_view_color
 
 
 @dataclass
@@ -54,7 +55,8 @@ class Stage:
     number: of the level, from 0. level: its plan. grid, store: the field, padded records [T, 4, 4, 4, P] of floats or of
     codes (see ``torch_surfcap.codes``). moved:
     iterations at full rate since the integration ranges were found. compared: the rate at which the gathered gradient
-    was held against the exact one last. seconds: spent per kind of work.
+    was held against the exact one last. seconds: spent per kind of work. view: the view-dependent colour, where it is not in
+    the records.
     """
 
     number: int
@@ -68,6 +70,7 @@ class Stage:
     moved: float = 0.0
     compared: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
+    view: ViewColor | None = None
 
     def table(self, settings: FitSettings) -> Tensor:
         """The grid's table, where the whole box is visited without what it says about empty space."""
@@ -93,17 +96,26 @@ def begin_adam(store: Tensor, settings: FitSettings) -> TileAdam:
 
 
 def begin_stage(
-    settings: FitSettings, plan: list[Level], number: int, grid: TileGrid, store: Tensor, studio: Studio
+    settings: FitSettings,
+    plan: list[Level],
+    number: int,
+    grid: TileGrid,
+    store: Tensor,
+    studio: Studio,
+    view: ViewColor | None = None,
 ) -> Stage:
-    """A level before its first iteration: rays gathered, Adam at rest."""
+    """A level before its first iteration: rays gathered, Adam at rest. view: of the level before."""
     level, descent = plan[number], settings.descent
-    store = codes.encode(store, *MISSING[settings.opacity], settings.storage)
+    floats, store = store, codes.encode(store, *MISSING[settings.opacity], settings.storage)
     march = march_of(settings, level, number == len(plan) - 1)
     capture = studio.pictures[level.halvings]
     rays = gather_rays(capture, store, grid, settings.opacity, march, descent.bundle, descent.visit)
     rays.expose(capture, studio.backdrop, studio.exposure)
     adam = begin_adam(store, settings)
-    return Stage(number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations))
+    view = begin_view_color(settings, grid, floats, rays, march, view)
+    return Stage(
+        number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations), view=view
+    )
 
 
 def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: Floor | None = None) -> Studio:
@@ -123,7 +135,7 @@ def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: S
     watch = Stopwatch({})
     done = stage.decoded(settings.opacity, studio.floor)
     grid, store = next_level(stage.grid, done, settings, stage.rays, stage.march)
-    following = begin_stage(settings, plan, stage.number + 1, grid, store, studio)
+    following = begin_stage(settings, plan, stage.number + 1, grid, store, studio, stage.view)
     watch.lap("prepare")
     following.seconds |= watch.seconds
     return following

@@ -146,7 +146,7 @@ def view_dependent_part(field: SurfaceField) -> SurfaceField:
     """The field with mid grey in place of β_00: what depends on the direction of view, brighter or darker than that."""
     voxels = field.voxels.detach().clone()
     voxels[..., 1:4] = MID_GREY
-    return type(field)(voxels, field.grid, field.opacity, field.step)
+    return type(field)(voxels, field.grid, field.opacity, field.step, field.view)
 
 
 def field_box(field: SurfaceField) -> tuple[Tensor, Tensor]:
