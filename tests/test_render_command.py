@@ -91,6 +91,17 @@ def test_views_by_number_and_split_and_size(folder: Path) -> None:
     assert covered == pytest.approx(np.pi * (FOCAL / SIZE * RADIUS / 2) ** 2, rel=0.12)
 
 
+def test_a_window_of_a_view(folder: Path) -> None:
+    """The same pixels as in the whole picture, at its size and enlarged."""
+    view = ["--what", "shaded", "--view", "test_1", "--samples", "1"]
+    (whole,) = rendered(folder, *view).values()
+    (part,) = rendered(folder, *view, "--crop", "0.25,0.5,0.5,0.25").values()
+    left, top = SIZE // 4, SIZE // 2
+    assert np.array_equal(part, whole[top : top + SIZE // 4, left : left + SIZE // 2])
+    (large,) = rendered(folder, *view, "--crop", "0.25,0.5,0.5,0.25", "--size", str(SIZE)).values()
+    assert large.shape == (SIZE // 2, SIZE, 3)
+
+
 def test_error_is_green_where_there_is_no_truth(folder: Path) -> None:
     found = rendered(
         folder, "--what", "error", "--mesh-truth", str(folder / "half.ply"), "--view", "train/0", "train/4"
@@ -153,6 +164,8 @@ def test_section(folder: Path) -> None:
         (["--turntable", "4", "--up", "0,0,0"], "--up is '0,0,0', expected x, y, z"),
         (["--turntable", "4", "--up", "north"], "--up is 'north'"),
         (["--cut", "0"], "--cut is 0"),
+        (["--crop", "0.5,0,0.6,1"], "--crop is '0.5,0,0.6,1', expected left,top,width,height"),
+        (["--crop", "0.5"], "--crop is '0.5'"),
     ],
 )
 def test_bad_input_is_one_line(

@@ -1,6 +1,7 @@
 """Render a finished run from any camera.
 
     python train/render.py --run OUT [--what volume,raster,...] [--view NAME|number|train|test ...] [--size PIXELS]
+                           [--crop 0.3,0.1,0.4,0.4]
     python train/render.py --run OUT --turntable 96 [--elevation 15] [--up z]
     python train/render.py --run OUT --section y=0.1
 
@@ -75,7 +76,7 @@ def render(options: argparse.Namespace) -> list[Path]:
     """Write the pictures that the options name, and return their files."""
     run = Path(options.run)
     config, field, mesh = read_run(run)
-    kinds = _kinds(options, field.sh_degree)
+    kinds = _kinds(options, max(field.sh_degree, field.view.sh_degree if field.view else 0))
     _check_numbers(options)
     (axis, position), poses = _section(options.section, mesh), _poses(config)
     up = _up(options.up, poses)
@@ -92,6 +93,8 @@ def render(options: argparse.Namespace) -> list[Path]:
         write_section(written[-1], field, axis, position, size, up, config.mesh.threshold)
     if views is not None:
         names, cameras = views
+        if options.crop is not None:
+            cameras = cameras.cropped(*_crop(options.crop))
         cameras = cameras if options.size is None else cameras.scaled_to(options.size)
         written += _write_views(subject, top, shown, names, cameras, options.samples, out)
     if shown and options.turntable:
@@ -248,6 +251,20 @@ def _section(given: str | None, mesh: trimesh.Trimesh) -> tuple[int, float]:
     return axis, place
 
 
+def _crop(given: str) -> tuple[float, float, float, float]:
+    """Left, top, width and height of a window within the picture."""
+    try:
+        left, top, width, height = (float(x) for x in given.split(","))
+        within = 0 <= left < left + width <= 1 and 0 <= top < top + height <= 1
+    except ValueError:
+        within = False
+    if not within:
+        raise InputError(
+            f"--crop is {given!r}, expected left,top,width,height as shares such as 0.3,0.1,0.4,0.4"
+        )
+    return left, top, width, height
+
+
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     kinds = {**KINDS, "section": "a plane through the field with its tiles and the level set"}
     parser = argparse.ArgumentParser(
@@ -262,6 +279,9 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--size", type=int, help="pixels of the longer side; a view's own, 720, or 1000 for sections"
+    )
+    parser.add_argument(
+        "--crop", metavar="X,Y,W,H", help="a window of each view, as shares of its width and height"
     )
     parser.add_argument(
         "--samples", type=int, default=2, help="rays per pixel and side where the mesh is shown"

@@ -148,6 +148,14 @@ class Cameras:
         size = (self.size * longer / self.size.amax(dim=1, keepdim=True)).round().long().clamp(min=1)
         return self.resized(size / self.size, size)
 
+    def cropped(self, left: float, top: float, width: float, height: float) -> Cameras:
+        """The cameras of a window of their pictures, given by its corner and size as shares of theirs."""
+        corner = (self.size * torch.tensor([left, top])).round().long()
+        size = (self.size * torch.tensor([width, height])).round().long().clamp(min=1)
+        K = self.K.clone()
+        K[:, :2, 2] -= corner
+        return Cameras(K, self.world_to_camera, size)
+
     def scaled_half(self) -> Cameras:
         """The cameras of the 2x2 means: K/2, size // 2 (an odd last row or column is dropped)."""
         return self.resized(torch.full((len(self), 2), 0.5), self.size // 2)
