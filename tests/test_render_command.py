@@ -93,12 +93,12 @@ def test_views_by_number_and_split_and_size(folder: Path) -> None:
 
 def test_a_window_of_a_view(folder: Path) -> None:
     """The same pixels as in the whole picture, at its size and enlarged."""
-    view = ["--what", "shaded", "--view", "test_1", "--samples", "1"]
-    (whole,) = rendered(folder, *view).values()
-    (part,) = rendered(folder, *view, "--crop", "0.25,0.5,0.5,0.25").values()
+    view = ["--what", "shaded", "--view", "9", "--samples", "1"]
+    whole = rendered(folder, *view)["test_1_shaded"]
+    part = rendered(folder, *view, "--crop", "0.25,0.5,0.5,0.25")["test_1_shaded"]
     left, top = SIZE // 4, SIZE // 2
     assert np.array_equal(part, whole[top : top + SIZE // 4, left : left + SIZE // 2])
-    (large,) = rendered(folder, *view, "--crop", "0.25,0.5,0.5,0.25", "--size", str(SIZE)).values()
+    large = rendered(folder, *view, "--crop", "0.25,0.5,0.5,0.25", "--size", str(SIZE))["test_1_shaded"]
     assert large.shape == (SIZE // 2, SIZE, 3)
 
 

@@ -114,7 +114,7 @@ def fused_step(scene: Scene) -> Result:
     """This library's step."""
     terms: list[Any] = [HUBER, WEIGHTS, False, ops.GROUPS, None, scene.gradients]
     arguments = [*scene.field_and_rays(), *scene.seen, *MARCH, *terms]
-    losses, gradient, _, _ = ops.photometric_step(*arguments)
+    losses, gradient, *_ = ops.photometric_step(*arguments)
     return losses, gradient
 
 

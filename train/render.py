@@ -79,7 +79,7 @@ def render(options: argparse.Namespace) -> list[Path]:
     kinds = _kinds(options, max(field.sh_degree, field.view.sh_degree if field.view else 0))
     _check_numbers(options)
     (axis, position), poses = _section(options.section, mesh), _poses(config)
-    up = _up(options.up, poses)
+    up, crop = _up(options.up, poses), options.crop and _crop(options.crop)
     shown = [kind for kind in kinds if kind != "section"]
     still = shown and (options.view or not options.turntable)
     views = _views(_load(config), options.view) if still else None
@@ -93,8 +93,8 @@ def render(options: argparse.Namespace) -> list[Path]:
         write_section(written[-1], field, axis, position, size, up, config.mesh.threshold)
     if views is not None:
         names, cameras = views
-        if options.crop is not None:
-            cameras = cameras.cropped(*_crop(options.crop))
+        if crop is not None:
+            cameras = cameras.cropped(*crop)
         cameras = cameras if options.size is None else cameras.scaled_to(options.size)
         written += _write_views(subject, top, shown, names, cameras, options.samples, out)
     if shown and options.turntable:

@@ -71,6 +71,27 @@ def test_rays_equal_the_reference(degree: int, opacity: str) -> None:
     torch.testing.assert_close(out.transmittance, expected[1])
 
 
+@pytest.mark.parametrize("opacity", OPACITIES)
+def test_a_view_field_is_read_once_per_ray(opacity: str) -> None:
+    """At the depth, with the weight of what the ray meets; a point has its colour whole, and none of its opacity."""
+    plain, view = random_field(0, opacity), random_field(2, "distance")
+    field = SurfaceField(plain.voxels, plain.grid, opacity, plain.step, view)
+    origins, directions = some_rays(field)
+    out, bare = field(origins, directions), plain(origins, directions)
+    hit = ~bare.depth.isnan()
+    points = origins[hit] + bare.depth[hit, None] * directions[hit]
+    added = (1 - bare.transmittance[hit, None]) * view.sample(points, directions[hit])[1]
+    assert hit.any()
+    torch.testing.assert_close(out.color[hit], bare.color[hit] + added)
+    assert torch.equal(out.transmittance, bare.transmittance)
+    value, color = field.sample(points, directions[hit])
+    alone, beneath = plain.sample(points, directions[hit])
+    assert torch.equal(value, alone)
+    torch.testing.assert_close(color, beneath + view.sample(points, directions[hit])[1])
+    both = torch.autograd.grad(out.color[hit].sum(), [field.voxels, *view.parameters()])
+    assert all(gradient.any() for gradient in both)
+
+
 def test_no_background_is_black() -> None:
     field = random_field()
     origins, directions = some_rays(field)

@@ -131,6 +131,19 @@ def test_budget_grows_with_levels_and_degree() -> None:
     assert bytes_by_degree == sorted(bytes_by_degree)
 
 
+def test_budget_counts_the_coarse_grid() -> None:
+    """More than without view-dependent colour, less than with it in every voxel."""
+    capture = ball(6, 64)
+    box = subject_box(capture, None)
+    plan = plan_levels(capture, box, 0.01, 3)
+    needed = []
+    for given in ({"sh_degree": 0}, {"sh_degree": 2, "view_spacing": 4}, {"sh_degree": 2}):
+        settings = FitSettings.of(**given)
+        grid, store = first_field(capture, box, plan[0].voxel_size, settings)
+        needed.append(estimate(capture, plan, grid, store, settings).level_bytes[-1])
+    assert needed[0] < needed[1] < 0.6 * needed[2]
+
+
 def test_shortage_is_one_line() -> None:
     assert shortage(1) is None
     sentence = shortage(1 << 60)

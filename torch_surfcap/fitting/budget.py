@@ -21,6 +21,8 @@ GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the 
 GROUPS = (4, 32)  # fewest, most
 CODE_GROUPS = 2  # the same beside codes, whose reason is to save memory
 BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
+BYTES_PER_COARSE_NUMBER = 4 * (3 + ops.GROUPS)  # of the view-dependent colour's own grid
+VIEW_BYTES_PER_RAY = 80  # what a ray reads there, where, and the photograph without it
 SURFACE = {"transparency": 0.99, "distance": 0.0}  # opacity value on the hull's surface, where a fit starts
 AREA_PER_BORDER = 0.6  # voxel faces of area per voxel at the border of a ball, counted
 TILES_PER_AREA = 2.5  # stored tiles per tile face of surface, measured
@@ -51,7 +53,11 @@ def estimate(
         tiles = len(store) if number == 0 else TILES_PER_AREA * area * 4**number
         numbers = int(tiles * ops.TILE**3 * pitch)
         rays = RAY_MARGIN * pixels / 4**level.halvings
-        level_bytes.append(int(bytes_per_number(numbers, settings) * numbers + BYTES_PER_RAY * rays))
+        needed = bytes_per_number(numbers, settings) * numbers + BYTES_PER_RAY * rays
+        if settings.degree != settings.voxel_degree:  # coarse tiles are as many as they are larger
+            coarse = tiles / settings.view_spacing**2 * ops.TILE**3 * ops.pitch(settings.degree)
+            needed += BYTES_PER_COARSE_NUMBER * coarse + VIEW_BYTES_PER_RAY * rays
+        level_bytes.append(int(needed))
         samples += rays * level.iterations * SAMPLES_PER_RAY
     return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
 

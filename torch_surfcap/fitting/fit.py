@@ -138,7 +138,7 @@ def fit(
             checkpoints.save(s, capture, box, stage, studio, so_far)
     watch.lap("fit")
     step = stage.march.step / stage.grid.voxel_size
-    view = stage.view and stage.view.field()
+    view = None if stage.view is None else stage.view.field()
     surface = SurfaceField(stage.decoded(s.opacity, floor), stage.grid, s.opacity, step, view)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")

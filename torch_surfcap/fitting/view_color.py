@@ -121,5 +121,6 @@ def covering(grid: TileGrid, spacing: int) -> TileGrid:
     for corner in range(8):
         x, y, z = (ends[corner >> axis & 1, :, axis] for axis in range(3))
         stored[x, y, z] = True
-    x, y, z = (o - edge * grid.voxel_size for o in grid.origin)
-    return TileGrid.build(stored, torch.zeros_like(stored), (x, y, z), spacing * grid.voxel_size)
+    low_x, low_y, low_z = (o - edge * grid.voxel_size for o in grid.origin)
+    origin = (low_x, low_y, low_z)
+    return TileGrid.build(stored, torch.zeros_like(stored), origin, spacing * grid.voxel_size)
