@@ -99,10 +99,15 @@ def begin_view_color(
     else:
         frames = [g.frame(*MISSING[KIND]) for g in (before.grid, coarse)]
         records = ops.upscale(before.store, before.grid.table, frames[0], coarse.places, frames[1])
-    lattice = (torch.zeros(len(rays)), torch.zeros(len(rays), 3))
-    frame = grid.frame(*MISSING[settings.opacity])
-    seen = ops.march_forward(store, grid.table, frame, rays.origins, rays.directions, *lattice, *march)
-    return ViewColor(coarse, records, begin_adam(records, settings), seen[2].nan_to_num(0.0))
+    frame, shift, black = (
+        grid.frame(*MISSING[settings.opacity]),
+        torch.zeros(len(rays)),
+        torch.zeros(len(rays), 3),
+    )
+    depth = ops.march_forward(store, grid.table, frame, rays.origins, rays.directions, shift, black, *march)[
+        2
+    ]
+    return ViewColor(coarse, records, begin_adam(records, settings), depth.nan_to_num(0.0))
 
 
 def begin_adam(records: Tensor, settings: FitSettings) -> TileAdam:
