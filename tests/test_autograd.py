@@ -10,13 +10,19 @@ import torch
 from torch import Tensor
 
 from tests.ops.fields import Scene, make_scene
-from torch_surfcap.autograd import March, MarchRays, PhotometricStep, SampleTiles, VoxelTerms
+from torch_surfcap.autograd import March, MarchRays, PhotometricStep, SampleTiles, ShadePoints, VoxelTerms
 
 Call = Callable[[Scene], Tensor]
 
 
 def sample(scene: Scene) -> Tensor:
     values: Tensor = SampleTiles.apply(*scene.field, scene.origins + 0.4 * scene.directions)
+    return values.sum()
+
+
+def shade(scene: Scene) -> Tensor:
+    points = scene.origins + 0.4 * scene.directions
+    values: Tensor = ShadePoints.apply(*scene.field, points, scene.directions)
     return values.sum()
 
 
@@ -39,7 +45,7 @@ def terms(scene: Scene) -> Tensor:
     return total
 
 
-CALLS = pytest.mark.parametrize("call", [sample, march, photometric, terms])
+CALLS = pytest.mark.parametrize("call", [sample, shade, march, photometric, terms])
 
 
 def scene_of(dtype: torch.dtype = torch.float64) -> Scene:
@@ -107,7 +113,7 @@ def test_changing_the_voxels_in_between_is_noticed(call: Call) -> None:
     (expected,) = torch.autograd.grad(before, leaf, retain_graph=True)
     with torch.no_grad():
         scene.voxels.add_(0.1)
-    if call in (sample, march):
+    if call in (sample, shade, march):
         with pytest.raises(RuntimeError, match="modified by an inplace operation"):
             torch.autograd.grad(before, leaf)
     else:

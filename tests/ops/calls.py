@@ -51,7 +51,7 @@ def points_of(scene: Scene) -> Tensor:
 
 def has_depth(transmittance: Tensor) -> Tensor:
     """Rays whose depth is more than rounding: where next to nothing is met, the quotient means little."""
-    return transmittance < 0.999
+    return transmittance < 0.99
 
 
 def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
@@ -175,6 +175,15 @@ def gather_arguments(scene: Scene) -> list[Any]:
     ]
 
 
+def settled(name: str, outputs: Sequence[Tensor]) -> list[Tensor]:
+    """What an op returned, with 0 for depths that are rounding."""
+    settled = list(outputs)
+    if name in TRANSMITTANCE:
+        at = TRANSMITTANCE[name]
+        settled[at + 1] = settled[at + 1].where(has_depth(settled[at]), 0)
+    return settled
+
+
 def cloned(arguments: Sequence[Any]) -> list[Any]:
     return [a.clone() if isinstance(a, Tensor) else a for a in arguments]
 
@@ -186,9 +195,7 @@ def run(module: ModuleType, name: str, arguments: Sequence[Any]) -> list[Tensor]
         given[i] = given[i].clone(memory_format=torch.contiguous_format)
     returned = getattr(module, name)(*given)
     outputs = [] if returned is None else [returned] if isinstance(returned, Tensor) else list(returned)
-    if name in TRANSMITTANCE:
-        at = TRANSMITTANCE[name]
-        outputs[at + 1] = outputs[at + 1].where(has_depth(outputs[at]), 0)
+    outputs = settled(name, outputs)
     outputs += [given[i] for i in WRITES.get(name, [])]
     if name == "photometric_lattice":
         outputs[-1] = outputs[-1] * reads_voxels(given)[:, None]

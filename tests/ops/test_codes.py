@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.ops.calls import GROUPS, MODES, arguments, normal, ops, raw, run
+from tests.ops.calls import GROUPS, MODES, arguments, has_depth, normal, ops, raw, run
 from tests.ops.fields import Scene, assert_close, doubled, make_scene, one_tile
 from torch_surfcap import codes, reference
 from torch_surfcap.reference import DISTANCE
@@ -265,6 +265,8 @@ def test_non_contiguous_empty_and_threads(name: str, bits: int, threads: None) -
 @pytest.mark.parametrize("name", ["photometric_step", "visibility", "voxel_terms", "adam_step"])
 def test_opcheck(name: str, bits: int) -> None:
     scene = narrow_scene(bits, rays=12)
+    values = codes.decode(scene.voxels, *scene.frame[4:])
+    scene = scene.select(has_depth(ops.march_forward(values, *scene.marched()[1:])[1]))
     given = [*adam_arguments(bits), 3] if name == "adam_step" else call(name, scene)
     op, raw_arguments = raw(name, given)
     if name == "photometric_step":

@@ -44,9 +44,7 @@ def test_slots_by_hand(device: str) -> None:
     slots = voxels.new_full((4, 4), 9.0)
     starts, first = torch.tensor([0, 4], device=device), torch.tensor([3], dtype=torch.int32, device=device)
     march, loss = (TRANSPARENCY, 0.0, 1.0, 0.0), (0.1, [1.0, 0.0, 0.0], False)
-    losses, _, _ = ops.photometric_lattice(
-        voxels, table, frame, *rays, *march, *loss, starts, first, 0, slots
-    )
+    losses, *_ = ops.photometric_lattice(voxels, table, frame, *rays, *march, *loss, starts, first, 0, slots)
     assert_close(losses, torch.tensor([0.0025, 0.06, 0.125], dtype=torch.float64))
     expected = 0.1 * torch.tensor(
         [[0.65, 0, 0, 0], [-0.7, 0.5, 0, 0], [-0.125, 0.1, 0, 0], [0.1, 0, 0, 0]], dtype=torch.float64

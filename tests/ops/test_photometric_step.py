@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.ops.calls import GROUPS, MODES, arguments, ops
+from tests.ops.calls import GROUPS, MODES, arguments, ops, settled
 from tests.ops.fields import assert_close, doubled, make_scene, one_tile
 from torch_surfcap import reference
 from torch_surfcap.autograd import March, PhotometricStep
@@ -29,12 +29,14 @@ def test_by_hand(device: str) -> None:
     numbers = ([[-4.0, 0.5, 0.5]], [[1.0, 0, 0]], [0.0], [[0.3, 0, 0]], [[0.6, 0, 0]], [0.75], [2.0])
     rays = [voxels.new_tensor(n) for n in numbers]
     march = (TRANSPARENCY, 0.0, 1.0, 0.0)
-    losses, gradient, color, transmittance = ops.photometric_step(
+    losses, gradient, color, transmittance, depth = ops.photometric_step(
         voxels, table, frame, *rays[:4], *rays[4:], *march, HUBER, [1.0, 0.0, 0.0], False, GROUPS
     )
     assert_close(losses, torch.tensor([0.0025, 0.06, 0.125], dtype=torch.float64))
     assert_close(color, torch.tensor([[0.65, 0, 0]], dtype=torch.float64))
     assert_close(transmittance, torch.zeros(1, dtype=torch.float64))
+    # Weights 1/2, 1/10, 0, 4/10 at distances 4.5, 5.5, 6.5, 7.5.
+    assert_close(depth, torch.tensor([0.5 * 4.5 + 0.1 * 5.5 + 0.4 * 7.5], dtype=torch.float64))
     # The photo loss pulls with 2 * 0.05 on red; dRed/da and dRed/dred as in test_march.
     expected = torch.zeros_like(voxels).cpu()
     expected[0, :, 0, 0, 0] = 0.1 * expected.new_tensor([-0.7, -0.125, 0.1, 0.02])
@@ -49,9 +51,43 @@ def test_each_loss_alone(detach: bool, weights: list[float], opacity: int, devic
     given = arguments("photometric_step", make_scene(opacity=opacity, device=device))
     given[-3:-1] = [weights, detach]
     for actual, expected in zip(
-        ops.photometric_step(*given), reference.photometric_step(*doubled(given)), strict=True
+        settled("photometric_step", ops.photometric_step(*given)),
+        settled("photometric_step", reference.photometric_step(*doubled(given))),
+        strict=True,
     ):
         assert_close(actual, expected)
+
+
+@pytest.mark.parametrize("opacity", MODES)
+@pytest.mark.parametrize("rendered", [False, True])
+def test_a_colour_that_all_samples_share(rendered: bool, opacity: int, device: str) -> None:
+    """Adding it to every sample is taking it from photograph and background: what view_color.py rests on."""
+    voxels, table, frame = one_tile(device=device)
+    g = torch.Generator().manual_seed(0)
+    voxels += torch.rand(voxels.shape, generator=g, dtype=torch.float64).to(voxels) - (
+        0.5 if opacity else 0.0
+    )
+    color = voxels.new_tensor([0.3, -0.2, 0.1])
+    brighter = voxels.clone()
+    brighter[..., 1:] += color
+    place = 0.5 + 3 * torch.rand(9, 2, generator=g, dtype=torch.float64)
+    origins = torch.cat([torch.full((9, 1), -4.0, dtype=torch.float64), place], 1).to(device)
+    directions = voxels.new_tensor([[1.0, 0, 0]]).expand(9, 3)
+    target, background = torch.rand(2, 9, 3, generator=g, dtype=torch.float64).to(device)
+    mask, weight = torch.rand(2, 9, generator=g, dtype=torch.float64).to(device)
+    # Within the tile: what is beyond is black.
+    ranges = torch.arange(10, device=device), voxels.new_tensor([[4.5, 7.5]]).expand(9, 2)
+
+    def step(field: Tensor, less: Tensor) -> tuple[Tensor, ...]:
+        rays = (origins, directions, torch.zeros_like(mask), background - less)
+        seen, march = (target - less, mask, weight), (opacity, 4.0, 0.7, 0.0)
+        loss = (HUBER, [1.0, 0.7, 0.3], False, GROUPS, ranges, None, rendered)
+        return ops.photometric_step(field, table, frame, *rays, *seen, *march, *loss)
+
+    whole, shifted = step(brighter, torch.zeros_like(color)), step(voxels, color)
+    assert_close(whole[2], (shifted[2] + color).cpu())
+    for at in (0, 1, 3, 4):
+        assert_close(whole[at], shifted[at].cpu())
 
 
 def test_detached_sample_loss_moves_colors_only(device: str) -> None:

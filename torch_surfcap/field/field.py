@@ -43,10 +43,10 @@ class SurfaceField(nn.Module):
     """A sparse voxel field of opacity and colour, rendered by marching rays and meshed by marching cubes.
 
     Attributes:
-        voxels: the one parameter, [T, 4, 4, 4, 1 + 3 (B + 1)^2]: the opacity value, then SH coefficients, RGB innermost.
+        voxels: the parameter, [T, 4, 4, 4, 1 + 3 (B + 1)^2]: the opacity value, then SH coefficients, RGB innermost.
         grid: which tiles there are. table: its table (a buffer). tile_coords: [T, 3] int32, relative to ``origin``.
         opacity: "transparency" (1 = empty) or "distance" (signed, in voxels, positive outside).
-        sh_degree: 0, 1 or 2.
+        sh_degree: 0, 1 or 2, of its own records.
         step: voxels between the samples of a ray: a transparency is that of a path of this length.
         view: another field, or None: its colour, read once per ray at the mean depth, is added to what the ray sees. A fit
             keeps view-dependent colours in one of larger voxels where ``view_spacing`` is more than 1.
@@ -72,6 +72,10 @@ class SurfaceField(nn.Module):
             raise ValueError(f"step: expected a positive number of voxels, got {step:g}")
         if opacity not in LEVEL:
             raise ValueError(f"opacity: expected transparency or distance, got {opacity!r}")
+        if view is not None:
+            found, like = [f"{x.dtype} on {x.device}" for x in (view.transparency, voxels)]
+            if found != like:
+                raise ValueError(f"view: expected {like} as the voxels, got {found}")
         expected = (len(grid.coords), ops.TILE, ops.TILE, ops.TILE)
         if voxels.dim() != 5 or tuple(voxels.shape[:4]) != expected:
             raise ValueError(f"voxels: expected {[*expected, '*']}, got {list(voxels.shape)}")
@@ -173,7 +177,7 @@ class SurfaceField(nn.Module):
             shift: [R] displacement of a ray's samples in steps. step: between samples, world units; the field's own by
                 default.
 
-        Differentiability: voxels and background.
+        Differentiability: voxels (and those of ``view``) and background.
         """
         dtype, device = self.voxels.dtype, self.voxels.device
         origins, directions = origins.to(device, dtype), directions.to(device, dtype)
@@ -201,7 +205,7 @@ class SurfaceField(nn.Module):
         """Transparency [P] and colour [P, 3] at ``points [P, 3]`` seen along unit ``directions [P, 3]``.
 
         The transparency of a signed distance s is that of a long step that ends there, 1/(1 + exp(-slope s)): 1 outside,
-        0 inside. Differentiability: voxels.
+        0 inside. Differentiability: voxels, and those of ``view``.
         """
         points, directions = (x.to(self.voxels.device, self.voxels.dtype) for x in (points, directions))
         values = ShadePoints.apply(self._store(), self.table, self._frame, points, directions)

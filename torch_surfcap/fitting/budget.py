@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_surfcap import ops
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.field.field import DIAGONAL
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.settings import FitSettings
 
@@ -21,12 +22,11 @@ GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the 
 GROUPS = (4, 32)  # fewest, most
 CODE_GROUPS = 2  # the same beside codes, whose reason is to save memory
 BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
-BYTES_PER_COARSE_NUMBER = 4 * (3 + ops.GROUPS)  # of the view-dependent colour's own grid
-VIEW_BYTES_PER_RAY = 80  # what a ray reads there, where, and the photograph without it
+VIEW_BYTES_PER_RAY = 100  # what a ray reads there, where, and the photograph without it
 SURFACE = {"transparency": 0.99, "distance": 0.0}  # opacity value on the hull's surface, where a fit starts
 AREA_PER_BORDER = 0.6  # voxel faces of area per voxel at the border of a ball, counted
 TILES_PER_AREA = 2.5  # stored tiles per tile face of surface, measured
-SAMPLES_PER_RAY = 8  # within the integration ranges, measured
+SAMPLES_PER_RAY = 8  # within the integration ranges, a voxel's diagonal apart, measured
 OVERHEAD = 2.0  # levels run longer than planned, and there are ranges, voxel terms and the mesh, measured
 SAMPLE_SECONDS = {4: 60e-9, 16: 90e-9, 32: 130e-9}  # forward and backward on one core, by pitch, measured
 RAY_MARGIN = 1.3  # rays per pixel of the silhouettes
@@ -55,10 +55,11 @@ def estimate(
         rays = RAY_MARGIN * pixels / 4**level.halvings
         needed = bytes_per_number(numbers, settings) * numbers + BYTES_PER_RAY * rays
         if settings.degree != settings.voxel_degree:  # coarse tiles are as many as they are larger
-            coarse = tiles / settings.view_spacing**2 * ops.TILE**3 * ops.pitch(settings.degree)
-            needed += BYTES_PER_COARSE_NUMBER * coarse + VIEW_BYTES_PER_RAY * rays
+            coarse = int(tiles / settings.view_spacing**2 * ops.TILE**3 * ops.pitch(settings.degree))
+            needed += 4 * (3 + gradient_groups(coarse)) * coarse + VIEW_BYTES_PER_RAY * rays
         level_bytes.append(int(needed))
-        samples += rays * level.iterations * SAMPLES_PER_RAY
+        step = settings.descent.step_of(level.last)
+        samples += rays * level.iterations * SAMPLES_PER_RAY * DIAGONAL / step
     return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
 
 

@@ -83,7 +83,7 @@ class Saved:
         rays.expose(capture, studio.backdrop, studio.exposure)
         adam = begin_adam(store, settings)
         adam.first, adam.second, adam.t = arrays["first"], arrays["second"], plain["t"]
-        march = march_of(settings, level, number == len(plan) - 1)
+        march = march_of(settings, level)
         rule = Plateau(**plain["rule"])
         return Stage(
             number,

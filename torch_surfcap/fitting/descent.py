@@ -26,12 +26,13 @@ FIRST_GAINS = 10  # iterations before the first: until then the field is grey an
 
 def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dict[str, float]]:
     """Fits ``stage.store`` in place until the level ends, and yields a row of losses (each unweighted, and their weighted
-    sum) per iteration. Between two rows, all that the next one depends on lies in ``stage`` and ``studio``."""
+    sum) per iteration; smoothness and parsimony of a view-dependent colour on its own grid are not among them. Between two
+    rows, all that the next one depends on lies in ``stage`` and ``studio``."""
     loss = settings.losses
     ray_weights, voxel_weights = (
         [getattr(loss, name) for name in names] for names in (RAY_LOSSES, VOXEL_LOSSES)
     )
-    if stage.level.halvings > 0:
+    if not stage.level.last:
         voxel_weights[CURVATURE] *= loss.coarse_curvature
     store, grid, rays, rule, view = stage.store, stage.grid, stage.rays, stage.rule, stage.view
     frame = grid.frame(*MISSING[settings.opacity])
@@ -64,6 +65,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
         if view:
             offset = view.seen_by(rays)
             arguments |= {"target": rays.target - offset, "background": rays.background - offset}
+            watch.lap("view")
         arguments["shift"] = gathered.per_ray(shift) if gathered else shift
         cosines: dict[str, float] = {}
         if gathered:

@@ -35,11 +35,12 @@ SEEN = 0.02  # largest weight above which a voxel belongs to the surface; larges
 
 @dataclass(frozen=True)
 class Level:
-    """voxel_size in world units; halvings of the pictures; iterations that recipe-like scenes take."""
+    """voxel_size in world units; halvings of the pictures; iterations that recipe-like scenes take; last: the finest one."""
 
     voxel_size: float
     halvings: int
     iterations: int
+    last: bool
 
 
 def plan_levels(
@@ -59,7 +60,8 @@ def plan_levels(
     for index in range(levels):
         behind = levels - 1 - index
         halvings = min(behind, max(0, side.bit_length() - 3))
-        plan.append(Level(finest * 2**behind, halvings, ITERATIONS[max(0, len(ITERATIONS) - 1 - behind)]))
+        iterations = ITERATIONS[max(0, len(ITERATIONS) - 1 - behind)]
+        plan.append(Level(finest * 2**behind, halvings, iterations, behind == 0))
     return plan
 
 

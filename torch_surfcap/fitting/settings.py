@@ -48,6 +48,10 @@ class Descent:
     bundle: int = 1  # consecutive rays (8 x 8 pixels are 64) that share a list of integration ranges
     stop: float = 1e-3  # a ray ends when its transmittance is lower
 
+    def step_of(self, last: bool) -> float:
+        """Between samples at the last level or another, voxels."""
+        return self.last_step if last else self.step
+
 
 LOSSES = {
     "distance": Losses(),

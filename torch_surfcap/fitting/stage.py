@@ -83,10 +83,10 @@ class Stage:
         return store
 
 
-def march_of(settings: FitSettings, level: Level, last: bool) -> March:
+def march_of(settings: FitSettings, level: Level) -> March:
     """How the rays of a level are sampled."""
-    step = settings.descent.last_step if last else settings.descent.step
-    return March(ops.OPACITY[settings.opacity], SLOPE, step * level.voxel_size, settings.descent.stop)
+    step = settings.descent.step_of(level.last) * level.voxel_size
+    return March(ops.OPACITY[settings.opacity], SLOPE, step, settings.descent.stop)
 
 
 def begin_adam(store: Tensor, settings: FitSettings) -> TileAdam:
@@ -107,7 +107,7 @@ def begin_stage(
     """A level before its first iteration: rays gathered, Adam at rest. view: of the level before."""
     level, descent = plan[number], settings.descent
     floats, store = store, codes.encode(store, *MISSING[settings.opacity], settings.storage)
-    march = march_of(settings, level, number == len(plan) - 1)
+    march = march_of(settings, level)
     capture = studio.pictures[level.halvings]
     rays = gather_rays(capture, store, grid, settings.opacity, march, descent.bundle, descent.visit)
     rays.expose(capture, studio.backdrop, studio.exposure)

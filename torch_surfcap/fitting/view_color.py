@@ -22,6 +22,7 @@ from torch_surfcap.autograd import March
 from torch_surfcap.field.field import MISSING, SurfaceField
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
+from torch_surfcap.fitting.budget import gradient_groups
 from torch_surfcap.fitting.rays import RayBatch
 from torch_surfcap.fitting.settings import PARSIMONY_HUBER, FitSettings, Losses
 
@@ -43,9 +44,8 @@ class ViewColor:
 
     def seen_by(self, rays: RayBatch) -> Tensor:
         """v_r: [R, 3]."""
-        frame = self.grid.frame(*MISSING[KIND])
-        values = ops.shade_forward(self.store, self.grid.table, frame, self.points(rays), rays.directions)
-        return values[:, 1:]
+        read = (self.store, self.grid.table, frame_of(self.grid), self.points(rays), rays.directions)
+        return ops.shade_forward(*read)[:, 1:]
 
     def step(
         self,
@@ -67,11 +67,14 @@ class ViewColor:
         Args:
             residual: [R, 3] rendered colour minus photograph. transmittance: [R].
         """
-        pull = rays.weight * (1 - transmittance) * (losses.photo + losses.sample)
+        # Samples that are held against the rendering move with it.
+        share = losses.photo + (losses.sample if losses.sample_target == "observed" else 0.0)
+        pull = share * rays.weight * (1 - transmittance)
         by_value = torch.zeros(len(rays), 4)
         torch.mul(residual.clamp(-losses.huber, losses.huber), pull[:, None], out=by_value[:, 1:])
-        table, frame = self.grid.table, self.grid.frame(*MISSING[KIND])
-        gradient = ops.shade_backward(by_value, self.store, table, frame, self.points(rays), rays.directions)
+        table, frame = self.grid.table, frame_of(self.grid)
+        read = (self.store, table, frame, self.points(rays), rays.directions)
+        gradient = ops.shade_backward(by_value, *read, groups=gradient_groups(self.store.numel()))
         terms = [0.0, losses.tv_color, losses.parsimony, 0.0, 0.0]
         ops.voxel_terms(self.store, table, frame, self.grid.places, terms, PARSIMONY_HUBER, 1.0, gradient)
         return gradient
@@ -79,6 +82,11 @@ class ViewColor:
     def field(self) -> SurfaceField:
         """The coarse field as what a ``SurfaceField`` adds to its rays."""
         return SurfaceField(self.store, self.grid, KIND)
+
+
+def frame_of(grid: TileGrid) -> list[float]:
+    """The ``frame`` argument of the ops: all is 0 beyond the tiles."""
+    return grid.frame(0.0, 0.0)
 
 
 def begin_view_color(
@@ -97,8 +105,8 @@ def begin_view_color(
     if before is None:
         records = torch.zeros(len(coarse.coords), ops.TILE, ops.TILE, ops.TILE, ops.pitch(settings.degree))
     else:
-        frames = [g.frame(*MISSING[KIND]) for g in (before.grid, coarse)]
-        records = ops.upscale(before.store, before.grid.table, frames[0], coarse.places, frames[1])
+        whole = (before.store, before.grid.table, frame_of(before.grid))
+        records = ops.upscale(*whole, coarse.places, frame_of(coarse))
     frame, shift, black = (
         grid.frame(*MISSING[settings.opacity]),
         torch.zeros(len(rays)),
