@@ -36,7 +36,9 @@ def swollen_ball(
     the shifts of its cameras."""
     voxel = 0.024
     given: dict[str, Any] = {"opacity": opacity, "gradient": "gather", "lattice": lattice}
-    stage, _, settings = begun(ball(views, 64), voxel, 1, descent={"last_step": DIAGONAL}, **given)
+    if opacity == "distance":
+        given["descent"] = {"last_step": DIAGONAL}
+    stage, _, settings = begun(ball(views, 64), voxel, 1, **given)
     grid, store, rays = stage.grid, stage.store, stage.rays
     points = voxel_centers(grid).float()
     away = ((points - torch.tensor(CENTER)).norm(dim=-1) - RADIUS) / voxel - 0.5
@@ -62,9 +64,10 @@ def swollen_ball(
 
 @pytest.mark.parametrize(("opacity", "least"), [("transparency", 0.98), ("distance", 0.93)])
 def test_angle_to_the_exact_gradient(opacity: str, least: float) -> None:
-    """As measured, from 24 views at 2.4 pixels to a voxel's face and steps of a voxel's diagonal: 0.986 and 0.938 for the
-    opacity value, 0.980 and 0.976 for colour. A distance's derivative changes its sign across the surface, within what a
-    voxel reads. The sums over all voxels agree far better than that: the density of samples is the right factor."""
+    """As measured, from 24 views at 2.4 pixels to a voxel's face, a distance with steps of a voxel's diagonal: 0.986 and
+    0.938 for the opacity value, 0.980 and 0.976 for colour. A distance's derivative changes its sign across the surface,
+    within what a voxel reads. The sums over all voxels agree far better than that: the density of samples is the right
+    factor."""
     gathered, arguments, shift = swollen_ball(opacity, views=24)
     losses, gradient, *_ = gathered.step(arguments, shift, Stopwatch({}))
     exact_losses, exact, *_ = ops.photometric_step(**arguments, ranges=gathered.rays.ranges)

@@ -49,9 +49,9 @@ def points_of(scene: Scene) -> Tensor:
     return scene.origins + 0.4 * scene.directions
 
 
-def has_depth(transmittance: Tensor) -> Tensor:
+def has_depth(transmittance: Tensor, least: float = 0.001) -> Tensor:
     """Rays whose depth is more than rounding: where next to nothing is met, the quotient means little."""
-    return transmittance < 0.99
+    return transmittance < 1 - least
 
 
 def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
@@ -180,7 +180,10 @@ def settled(name: str, outputs: Sequence[Tensor]) -> list[Tensor]:
     settled = list(outputs)
     if name in TRANSMITTANCE:
         at = TRANSMITTANCE[name]
-        settled[at + 1] = settled[at + 1].where(has_depth(settled[at]), 0)
+        least = (
+            0.001 if name == "march_forward" else 0.01
+        )  # what codes and floats are held to is narrower there
+        settled[at + 1] = settled[at + 1].where(has_depth(settled[at], least), 0)
     return settled
 
 
