@@ -23,6 +23,7 @@ from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting import view_color
+from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.levels import Level
 from torch_surfcap.fitting.plateau import Plateau
@@ -31,6 +32,8 @@ from torch_surfcap.fitting.settings import FitSettings
 from torch_surfcap.fitting.stage import Stage, Studio, begin_adam, march_of
 from torch_surfcap.fitting.view_color import ViewColor
 from torch_surfcap.version import VERSION
+
+VIEW = "view_"  # begins the names of what is the view-dependent colour's own
 
 
 @dataclass
@@ -70,8 +73,7 @@ class Saved:
         arrays, plain = {name: torch.from_numpy(a) for name, a in self.arrays.items()}, self.plain
         studio.exposure = Exposure(arrays["gain"], arrays["bias"])
         studio.generator.set_state(arrays["generator"])
-        x, y, z = plain["origin"]
-        grid = TileGrid(arrays["table"], arrays["coords"], (x, y, z), plain["voxel_size"])
+        grid = self._grid(arrays)
         number = plain["number"]
         level, store = plan[number], arrays["store"]
         capture = studio.pictures[level.halvings]
@@ -81,8 +83,7 @@ class Saved:
         ranges = (offsets, arrays["ranges"]) if settings.descent.visit == "ranges" else None
         rays = rays_of(capture, grid, list(pixels), ranges, settings.descent.bundle)
         rays.expose(capture, studio.backdrop, studio.exposure)
-        adam = begin_adam(store, settings)
-        adam.first, adam.second, adam.t = arrays["first"], arrays["second"], plain["t"]
+        adam = self._continued(begin_adam(store, settings), arrays)
         march = march_of(settings, level)
         rule = Plateau(**plain["rule"])
         return Stage(
@@ -104,11 +105,18 @@ class Saved:
         """The view-dependent colour, where it is on a grid of its own."""
         if "view_store" not in arrays:
             return None
-        x, y, z = self.plain["view_origin"]
-        grid = TileGrid(arrays["view_table"], arrays["view_coords"], (x, y, z), self.plain["view_voxel_size"])
-        adam = view_color.begin_adam(arrays["view_store"], settings)
-        adam.first, adam.second, adam.t = arrays["view_first"], arrays["view_second"], self.plain["t"]
-        return ViewColor(grid, arrays["view_store"], adam, arrays["view_depth"])
+        store = arrays["view_store"]
+        adam = self._continued(view_color.begin_adam(store, settings), arrays, VIEW)
+        return ViewColor(self._grid(arrays, VIEW), store, adam, arrays["view_depth"])
+
+    def _grid(self, arrays: dict[str, Tensor], prefix: str = "") -> TileGrid:
+        x, y, z = self.plain[prefix + "origin"]
+        table, coords = arrays[prefix + "table"], arrays[prefix + "coords"]
+        return TileGrid(table, coords, (x, y, z), self.plain[prefix + "voxel_size"])
+
+    def _continued(self, adam: TileAdam, arrays: dict[str, Tensor], prefix: str = "") -> TileAdam:
+        adam.first, adam.second, adam.t = arrays[prefix + "first"], arrays[prefix + "second"], self.plain["t"]
+        return adam
 
 
 @dataclass
@@ -138,7 +146,7 @@ class Checkpoints:
         record: Record,
     ) -> None:
         """Replaces the file."""
-        rays, grid = stage.rays, stage.grid
+        rays = stage.rays
         offsets, ranges = rays.ranges or (torch.zeros(1, dtype=torch.int64), torch.zeros(0, 2))
         plain = {
             "version": VERSION,
@@ -151,18 +159,11 @@ class Checkpoints:
             "compared": stage.compared,
             "seconds": stage.seconds,
             "t": stage.adam.t,
-            "origin": grid.origin,
-            "voxel_size": grid.voxel_size,
             "rays_per_camera": np.diff(rays.camera_starts).tolist(),
             "box": torch.stack(box).tolist(),
             "record": asdict(record),
         }
         arrays = {
-            "store": stage.store,
-            "first": stage.adam.first,
-            "second": stage.adam.second,
-            "table": grid.table,
-            "coords": grid.coords,
             "pixels": rays.pixels,
             "range_counts": offsets.diff().int(),
             "ranges": ranges,
@@ -170,17 +171,15 @@ class Checkpoints:
             "gain": studio.exposure.gain,
             "bias": studio.exposure.bias,
         }
+        fields = [("", stage.grid, stage.adam)]
         if stage.view:
-            view = stage.view
-            plain |= {"view_origin": view.grid.origin, "view_voxel_size": view.grid.voxel_size}
-            arrays |= {
-                "view_store": view.store,
-                "view_first": view.adam.first,
-                "view_second": view.adam.second,
-                "view_table": view.grid.table,
-                "view_coords": view.grid.coords,
-                "view_depth": view.depth,
-            }
+            fields.append((VIEW, stage.view.grid, stage.view.adam))
+            arrays["view_depth"] = stage.view.depth
+        for prefix, grid, adam in fields:
+            plain |= {prefix + "origin": grid.origin, prefix + "voxel_size": grid.voxel_size}
+            kept = {"store": adam.store, "first": adam.first, "second": adam.second}
+            kept |= {"table": grid.table, "coords": grid.coords}
+            arrays |= {prefix + name: array for name, array in kept.items()}
         data: dict[str, Any] = {name: array.numpy() for name, array in arrays.items()}
         data["plain"] = np.frombuffer(json.dumps(plain).encode(), dtype=np.uint8)
         with atomic_write(self.path) as partial, open(partial, "wb") as file:

@@ -107,14 +107,10 @@ def begin_view_color(
     else:
         whole = (before.store, before.grid.table, frame_of(before.grid))
         records = ops.upscale(*whole, coarse.places, frame_of(coarse))
-    frame, shift, black = (
-        grid.frame(*MISSING[settings.opacity]),
-        torch.zeros(len(rays)),
-        torch.zeros(len(rays), 3),
-    )
-    depth = ops.march_forward(store, grid.table, frame, rays.origins, rays.directions, shift, black, *march)[
-        2
-    ]
+    frame = grid.frame(*MISSING[settings.opacity])
+    shift, black = torch.zeros(len(rays)), torch.zeros(len(rays), 3)
+    origins, directions = rays.origins, rays.directions
+    _, _, depth = ops.march_forward(store, grid.table, frame, origins, directions, shift, black, *march)
     return ViewColor(coarse, records, begin_adam(records, settings), depth.nan_to_num(0.0))
 
 
