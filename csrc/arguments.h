@@ -12,6 +12,7 @@
 #include <initializer_list>
 #include <optional>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "core/views.h"
@@ -21,6 +22,10 @@ namespace surfcap {
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 using Shape = std::initializer_list<int64_t>;
+
+// What a tensor holds is looked at here only where that costs next to nothing: on a device it would stop the host until
+// the device has caught up. There the caller (TileGrid.check, gather_rays, ...) vouches for it.
+inline bool on_host(const Tensor& t) { return t.is_cpu(); }
 
 constexpr int64_t kAny = -1;  // a size that any number satisfies
 constexpr int64_t kTileSide = 4, kVoxelsPerTile = 64;
@@ -71,6 +76,9 @@ template <> struct TypeOf<Half> {
   static constexpr auto value = ScalarType::Half;
   static constexpr const char* name = "float16";
 };
+
+// Tensors with their names, "a, b, c": what a device is made from, to check that all of a call's are on it.
+#define SURFCAP_NAMED(...) #__VA_ARGS__, {__VA_ARGS__}
 
 // A contiguous tensor of the right type, kept alive as long as the pointer is used.
 template <class Number> class Input {
@@ -134,6 +142,7 @@ template <class Real, class Stored = Real> struct FieldArgument {
       : voxels("voxels", v, {kAny, kTileSide, kTileSide, kTileSide, kAny}),
         table("table", t, {kAny, kAny, kAny}),
         view(field_view<Real>(voxels, table, frame)) {
+    if (!on_host(t)) return;
     // An index beyond the tiles would read foreign memory; one pass over the table costs little beside any op.
     const auto [least, most] = std::minmax_element(table.data(), table.data() + t.numel());
     STD_TORCH_CHECK(*most < view.tiles && *least > -(1 << 20), "table: expected entries from ", -(1 << 20),
@@ -178,10 +187,13 @@ template <class Real> struct RangesArgument {
     const int64_t lists = (rays.count + bundle - 1) / bundle;
     offsets.emplace("range_offsets", *o, Shape{lists + 1});
     ranges.emplace("ranges", *r, Shape{kAny, 2});
-    STD_TORCH_CHECK(offsets->data()[lists] == r->size(0), "range_offsets: expected to end with ", r->size(0),
-                    ", the number of ranges, got ", offsets->data()[lists]);
-    STD_TORCH_CHECK(offsets->data()[0] == 0 && std::is_sorted(offsets->data(), offsets->data() + lists + 1),
-                    "range_offsets: expected numbers that begin with 0 and do not fall");
+    if (on_host(*o)) {
+      const int64_t *const begin = offsets->data(), *const end = begin + lists;
+      STD_TORCH_CHECK(*end == r->size(0), "range_offsets: expected to end with ", r->size(0),
+                      ", the number of ranges, got ", *end);
+      STD_TORCH_CHECK(*begin == 0 && std::is_sorted(begin, end + 1),
+                      "range_offsets: expected numbers that begin with 0 and do not fall");
+    }
     rays.range_offsets = offsets->data();
     rays.ranges = ranges->data();
     rays.bundle = bundle;
@@ -226,7 +238,7 @@ template <class Real, class Stored> struct PhotometricArgument {
 // The places of the field's tiles in its table.
 inline Input<int32_t> tile_places(const Tensor& coordinates, int64_t tiles, const int32_t (&n)[3]) {
   Input<int32_t> places("coordinates", coordinates, {tiles, 3});
-  for (int64_t i = 0; i < 3 * tiles; ++i)
+  for (int64_t i = 0; on_host(coordinates) && i < 3 * tiles; ++i)
     STD_TORCH_CHECK(places.data()[i] > 0 && places.data()[i] < n[i % 3] - 1,
                     "coordinates: expected every tile inside the table's border");
   return places;
@@ -249,16 +261,18 @@ template <class Real> struct SlotRowsArgument {
     STD_TORCH_CHECK(narrow || slots.scalar_type() == TypeOf<Real>::value, "slots: expected uint8 or ",
                     TypeOf<Real>::name);
     STD_TORCH_CHECK(slots.is_contiguous(), "slots: expected contiguous memory");
+    STD_TORCH_CHECK(exponent >= -100 && exponent <= 100, "exponent: expected -100 to 100, got ", exponent);
+    if (!on_host(slots)) return;
     STD_TORCH_CHECK(*starts.data() == 0 && end[-1] == slots.size(0) && std::is_sorted(starts.data(), end),
                     "starts: expected numbers that begin with 0, do not fall and end with the number of slots, ",
                     slots.size(0));
-    STD_TORCH_CHECK(exponent >= -100 && exponent <= 100, "exponent: expected -100 to 100, got ", exponent);
   }
 };
 
-// Runs f<float> or f<double> by the type of `t`.
-#define SURFCAP_BY_TYPE(t, f, ...) \
-  ((t).scalar_type() == ScalarType::Double ? f<double>(__VA_ARGS__) : f<float>(__VA_ARGS__))
+// Runs f(Real(0)), Real being float or double, by the type of `t`.
+template <class F> auto by_real(const Tensor& t, const F& f) {
+  return t.scalar_type() == ScalarType::Double ? f(0.0) : f(0.0f);
+}
 
 // Runs f(types) by how a field is stored and gradients are summed: numbers of 32 or 64 bits in their own type, codes of
 // 8 and 16 bits computed with in float.

@@ -8,20 +8,14 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-// On records of numbers.
-template <class Real, int Pitch>
-SURFCAP_HD void adam_records(Real* value, const Real* gradient, Real* first, Real* second, int64_t records,
-                             const AdamSettings<Real>& adam) {
-  for (int64_t r = 0; r < records; ++r) {
-    for (int i = 0; i < Pitch; ++i) {
-      const int64_t at = r * Pitch + i;
-      const Real g = gradient[at];
-      first[at] = adam.beta1 * first[at] + (Real(1) - adam.beta1) * g;
-      second[at] = adam.beta2 * second[at] + (Real(1) - adam.beta2) * g * g;
-      const Real step = first[at] * adam.correction1 / (std::sqrt(second[at] * adam.correction2) + adam.epsilon);
-      value[at] = clamped(value[at] - adam.rate[i] * step, adam.low[i], adam.high[i]);
-    }
-  }
+// On one number.
+template <class Real>
+SURFCAP_HD void adam_number(Real& value, Real g, Real& first, Real& second, Real rate, Real low, Real high,
+                            const AdamSettings<Real>& adam) {
+  first = adam.beta1 * first + (Real(1) - adam.beta1) * g;
+  second = adam.beta2 * second + (Real(1) - adam.beta2) * g * g;
+  const Real step = first * adam.correction1 / (std::sqrt(second * adam.correction2) + adam.epsilon);
+  value = clamped(value - rate * step, low, high);
 }
 
 // The moments beside codes: e5m2 and u5.3 beside codes of 8 bits, halves beside those of 16. The second moment is kept
@@ -45,46 +39,39 @@ SURFCAP_HD void keep_moments(const Pack<float, N>& m, const Pack<float, N>& root
   to_halves<N>(root, second);
 }
 
-// On the codes begin .. end, rows of 16 of whole records. Gradient and moments are in the scale of narrow sums, steps
-// in units of a code.
-template <int Pitch, class Stored, class Sum>
+// What coefficient i moves by when the moments agree, in codes.
+template <class Stored> SURFCAP_HD float code_rate(const AdamSettings<float>& adam, int i) {
+  const float span = adam.high[i] - adam.low[i];
+  return span > 0 ? adam.rate[i] * adam.correction1 * kSteps<Stored> / span : 0.0f;
+}
+
+// On the N codes from `at` on. Gradient and moments are in the scale of narrow sums, steps in units of a code.
+template <int N, class Stored, class Sum>
 SURFCAP_HD void adam_codes(Stored* value, const Sum* gradient, MomentOf<Stored>* first, MomentOf<Stored>* second,
-                           int64_t begin, int64_t end, const AdamSettings<float>& adam) {
-  constexpr int kRow = 16, kPeriod = Pitch < kRow ? kRow : Pitch;
+                           int64_t at, const Pack<float, N>& rates, const AdamSettings<float>& adam) {
   constexpr float kTop = kSteps<Stored>, kScale = float(kSumScale<Half> / kSumScale<Sum>);
-  using Row = Pack<float, kRow>;
-  float rate[kPeriod];  // codes
-  for (int i = 0; i < kPeriod; ++i) {
-    const float span = adam.high[i % Pitch] - adam.low[i % Pitch];
-    rate[i] = span > 0 ? adam.rate[i % Pitch] * adam.correction1 * kTop / span : 0.0f;
-  }
   const float correction2 = std::sqrt(adam.correction2), epsilon = adam.epsilon * float(kSumScale<Half>);
-  const bool stochastic = adam.stochastic;
-  const uint32_t key = adam.key;
-  for (int64_t at = begin; at < end; at += kRow) {
-    Row g;
-    if constexpr (std::is_same_v<Sum, Half>)
-      g = from_halves<kRow>(gradient + at);
-    else
-      g = kScale * load<float, kRow>(gradient + at);
-    const Row old = root_moment<kRow>(second + at);
-    const Row m = adam.beta1 * first_moment<kRow>(first + at) + (1 - adam.beta1) * g;
-    const Row v = adam.beta2 * old * old + (1 - adam.beta2) * g * g;
-    const Row rates = load<float, kRow>(rate + at % kPeriod);
-    float root[kRow];
-    uint32_t noise[kRow];
-    int32_t code[kRow];
-    store<int32_t, kRow>(code, widened<kRow>(value + at));
-    for (int i = 0; i < kRow; ++i) {
-      noise[i] = noise_of(uint32_t(at + i), key);
-      root[i] = std::sqrt(v[i]);
-      const float step = clamped(rates[i] * m[i] / (root[i] * correction2 + epsilon), -kTop, kTop);
-      const float up = stochastic ? float(int32_t(noise[i] >> 16)) * 0x1p-16f : 0.5f;
-      code[i] = clamped<int32_t>(code[i] + int32_t(std::floor(up - step)), 0, int32_t(kTop));
-    }
-    for (int i = 0; i < kRow; ++i) value[at + i] = Stored(code[i]);
-    keep_moments<kRow>(m, load<float, kRow>(root), noise, first + at, second + at);
+  Pack<float, N> g;
+  if constexpr (std::is_same_v<Sum, Half>)
+    g = from_halves<N>(gradient + at);
+  else
+    g = kScale * load<float, N>(gradient + at);
+  const Pack<float, N> old = root_moment<N>(second + at);
+  const Pack<float, N> m = adam.beta1 * first_moment<N>(first + at) + (1 - adam.beta1) * g;
+  const Pack<float, N> v = adam.beta2 * old * old + (1 - adam.beta2) * g * g;
+  float root[N];
+  uint32_t noise[N];
+  int32_t code[N];
+  store<int32_t, N>(code, widened<N>(value + at));
+  for (int i = 0; i < N; ++i) {
+    noise[i] = noise_of(uint32_t(at + i), adam.key);
+    root[i] = std::sqrt(v[i]);
+    const float step = clamped(rates[i] * m[i] / (root[i] * correction2 + epsilon), -kTop, kTop);
+    const float up = adam.stochastic ? float(int32_t(noise[i] >> 16)) * 0x1p-16f : 0.5f;
+    code[i] = clamped<int32_t>(code[i] + int32_t(std::floor(up - step)), 0, int32_t(kTop));
   }
+  for (int i = 0; i < N; ++i) value[at + i] = Stored(code[i]);
+  keep_moments<N>(m, load<float, N>(root), noise, first + at, second + at);
 }
 
 }  // namespace SURFCAP_ISA

@@ -21,7 +21,7 @@ template <class Sum> constexpr int kSumScale = 1;  // what sums are multiplied w
 template <> constexpr int kSumScale<Half> = 1024;  // a fit's gradients lie under 1 and matter above 1e-8
 
 template <int N> SURFCAP_HD Pack<int32_t, N> widened(const uint16_t* from) {
-  return convert_pack<int32_t, N, uint16_t>(load<uint16_t, N>(from));
+  return convert_pack<int32_t, N, uint16_t>(load_aligned<uint16_t, N>(from));
 }
 template <int N> SURFCAP_HD Pack<int32_t, N> widened(const uint8_t* from) {
 #if defined(SURFCAP_AVX512)
@@ -31,13 +31,13 @@ template <int N> SURFCAP_HD Pack<int32_t, N> widened(const uint8_t* from) {
 #if defined(SURFCAP_AVX2)
   if constexpr (N == 4) return Pack<int32_t, N>(_mm_cvtepu8_epi32(_mm_loadu_si32(from)));
 #endif
-  return convert_pack<int32_t, N, uint16_t>(convert_pack<uint16_t, N, uint8_t>(load<uint8_t, N>(from)));
+  return convert_pack<int32_t, N, uint16_t>(convert_pack<uint16_t, N, uint8_t>(load_aligned<uint8_t, N>(from)));
 }
 
 // N consecutive stored numbers as what one computes with, not yet decoded.
 template <class Real, int N, class Stored> SURFCAP_HD Pack<Real, N> load_as(const Stored* from) {
   if constexpr (std::is_same_v<Stored, Real>)
-    return load<Real, N>(from);
+    return load_aligned<Real, N>(from);
   else
     return convert_pack<Real, N, int32_t>(widened<N>(from));
 }

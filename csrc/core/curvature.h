@@ -10,73 +10,76 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-// Adds the gradient of `weight` times the term to the opacity values of a tile, and returns the term's share of the
-// tile's own voxels. `cell` is the tile's place in the table.
-template <class Real, class Stored, class Sum>
-SURFCAP_HD Real curvature_tile(const Field<Real, Stored>& field, int64_t cell, int64_t tile, Real weight, Real eps,
-                               Sum* gradient) {
-  constexpr int kSide = 2 * kTile, kHalo = 2;  // the tile with two voxels around it: a neighbour's neighbours
-  using Row = Pack<Real, kSide>;
-  const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
-  // Of codes, less than half a step inside: what a bound decodes to may be off by rounding.
-  const Real low_bound = smaller(field.missing[0], field.missing[1]),
-             high_bound = larger(field.missing[0], field.missing[1]);
-  const Real hair = kSteps<Stored> > 0 ? Real(0.25) / kSteps<Stored> * (high_bound - low_bound) : Real(0);
-  const Real low = low_bound + hair, high = high_bound - hair;
+constexpr int kHalo = 2, kHaloSide = kTile + 2 * kHalo;  // a tile with a neighbour's neighbours around it
+constexpr int kHaloVoxels = kHaloSide * kHaloSide * kHaloSide;  // [x][y][z], z fastest
+#if defined(SURFCAP_CUDA)
+constexpr int kRun = 1;  // voxels along z that a thread takes at once
+#else
+constexpr int kRun = kHaloSide;
+#endif
 
-  // bend: the norm's derivative by the Laplacian. Only rows with x and y in 1..6 are read with those around them, so
-  // the shifted rows along z never leave the arrays.
-  Real value[kSide * kSide * kSide], bend[kSide * kSide * kSide];
-  for (int x = 0; x < kSide; ++x) {
-    for (int y = 0; y < kSide; ++y) {
-      const int64_t column = cell + ((x + kHalo) / kTile - 1) * stride[0] + ((y + kHalo) / kTile - 1) * stride[1];
-      const int local = ((x + kHalo) % kTile * kTile + (y + kHalo) % kTile) * kTile;
-      for (int z = 0; z < kSide; ++z) {
-        const int32_t entry = field.table[column + (z + kHalo) / kTile - 1];
-        const int64_t voxel = int64_t(entry) * kTileVoxels + local + (z + kHalo) % kTile;
-        value[(x * kSide + y) * kSide + z] = entry < 0 ? field.missing[entry == kInside] : opacity_value(field, voxel);
+// The opacity value at (x, y, z) of the halo of the tile that stands at `cell` of the table.
+template <class Real, class Stored>
+SURFCAP_HD Real halo_value(const Field<Real, Stored>& field, int64_t cell, int x, int y, int z) {
+  const int32_t entry =
+      field.table[cell + (((x + kHalo) / kTile - 1) * field.n[1] + (y + kHalo) / kTile - 1) * int64_t(field.n[2]) +
+                  (z + kHalo) / kTile - 1];
+  const int local = ((x + kHalo) % kTile * kTile + (y + kHalo) % kTile) * kTile + (z + kHalo) % kTile;
+  return entry < 0 ? field.missing[entry == kInside] : opacity_value(field, int64_t(entry) * kTileVoxels + local);
+}
+
+// The 7-point Laplacian of kRun cells of the halo; those around them must be there, too.
+template <class Real> SURFCAP_HD Pack<Real, kRun> laplacian(const Real* at) {
+  const int along[3] = {kHaloSide * kHaloSide, kHaloSide, 1};
+  Pack<Real, kRun> sum = zero_pack<Real, kRun>();
+  for (int axis = 0; axis < 3; ++axis) sum += load<Real, kRun>(at - along[axis]) + load<Real, kRun>(at + along[axis]);
+  return sum - Real(6) * load<Real, kRun>(at);
+}
+
+// Where the curvature is known: strictly between the boundary values. Of codes, less than half a step inside: what a
+// bound decodes to may be off by rounding.
+template <class Real, class Stored> struct Known {
+  Real low, high;
+
+  SURFCAP_HD explicit Known(const Grid<Real>& grid) {
+    low = smaller(grid.missing[0], grid.missing[1]);
+    high = larger(grid.missing[0], grid.missing[1]);
+    const Real hair = kSteps<Stored> > 0 ? Real(0.25) / kSteps<Stored> * (high - low) : Real(0);
+    low += hair;
+    high -= hair;
+  }
+
+  // The norm's derivative by the Laplacian at kRun cells from number `first` on, x and y within 1..6; returns the sum of
+  // the norms of those that are the tile's own.
+  SURFCAP_HD Real bend(const Real* value, int first, Real eps, Real* bend) const {
+    using Run = Pack<Real, kRun>;
+    const Real* const at = value + first;
+    const Run here = load<Real, kRun>(at), difference = laplacian(at);
+    Run least = here, most = here;
+    const int along[3] = {kHaloSide * kHaloSide, kHaloSide, 1};
+    for (int axis = 0; axis < 3; ++axis) {
+      for (int side = -1; side <= 1; side += 2) {
+        const Run other = load<Real, kRun>(at + side * along[axis]);
+        least = smaller_pack<Real, kRun>(least, other);
+        most = larger_pack<Real, kRun>(most, other);
       }
     }
-  }
-
-  Real loss = Real(0);
-  const int along[3] = {kSide * kSide, kSide, 1};
-  const auto sum_of_neighbours = [&](const Real* at) {
-    Row sum = zero_pack<Real, kSide>();
-    for (int axis = 0; axis < 3; ++axis)
-      sum += load<Real, kSide>(at - along[axis]) + load<Real, kSide>(at + along[axis]);
-    return sum;
-  };
-  for (int x = 1; x < kSide - 1; ++x) {
-    for (int y = 1; y < kSide - 1; ++y) {
-      const int row = (x * kSide + y) * kSide;
-      const Row here = load<Real, kSide>(value + row);
-      Row least = here, most = here;
-      for (int axis = 0; axis < 3; ++axis) {
-        for (int side = -1; side <= 1; side += 2) {
-          const Row other = load<Real, kSide>(value + row + side * along[axis]);
-          least = smaller_pack<Real, kSide>(least, other);
-          most = larger_pack<Real, kSide>(most, other);
-        }
-      }
-      const Row difference = sum_of_neighbours(value + row) - Real(2 * 3) * here;
-      for (int z = 0; z < kSide; ++z) {
-        const bool known = z > 0 && z < kSide - 1 && least[z] > low && most[z] < high;
-        const Real norm = huber(known ? difference[z] : Real(0), eps, bend[row + z]);
-        if (x >= kHalo && x < kHalo + kTile && y >= kHalo && y < kHalo + kTile && z >= kHalo && z < kHalo + kTile)
-          loss += norm;
-      }
+    const auto own = [](int i) { return i >= kHalo && i < kHalo + kTile; };
+    Real loss = Real(0);
+    for (int i = 0; i < kRun; ++i) {
+      const int cell = first + i, x = cell / (kHaloSide * kHaloSide), y = cell / kHaloSide % kHaloSide;
+      const int z = cell % kHaloSide;
+      const bool known = z > 0 && z < kHaloSide - 1 && least[i] > low && most[i] < high;
+      const Real norm = huber(known ? difference[i] : Real(0), eps, bend[cell]);
+      if (own(x) && own(y) && own(z)) loss += norm;
     }
+    return loss;
   }
+};
 
-  for (int v = 0; v < kTileVoxels / kTile; ++v) {  // rows of the tile
-    const int row = ((v / kTile + kHalo) * kSide + v % kTile + kHalo) * kSide;
-    const Row here = load<Real, kSide>(bend + row);
-    const Row by_value = Real(kSumScale<Sum>) * weight * (sum_of_neighbours(bend + row) - Real(2 * 3) * here);
-    for (int z = 0; z < kTile; ++z)
-      add_to(gradient + (tile * kTileVoxels + v * kTile + z) * field.pitch, by_value[z + kHalo]);
-  }
-  return loss;
+// The number in the halo of the tile's voxel v.
+SURFCAP_HD int in_halo(int v) {
+  return ((v / (kTile * kTile) + kHalo) * kHaloSide + v / kTile % kTile + kHalo) * kHaloSide + v % kTile + kHalo;
 }
 
 }  // namespace SURFCAP_ISA

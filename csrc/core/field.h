@@ -14,109 +14,65 @@ constexpr int kTileVoxels = kTile * kTile * kTile;  // [x][y][z], z fastest
 constexpr int kInside = -1;                         // table entry: solid, no tile
 constexpr int kOutside = -2;  // table entry: empty, no tile; kOutside - d: and so is every cell nearer than d cells
 
-constexpr int kLanes = 8;  // samples set up together
+// Samples set up together by one thread.
+#if defined(SURFCAP_CUDA)
+constexpr int kLanes = 1;
+#else
+constexpr int kLanes = 8;
+#endif
 
-// Where kLanes points read the store: for each of the 8 corners (bit 2 = x, bit 1 = y, bit 0 = z) a voxel's index,
-// negative where there is no tile, and its trilinear weight.
-template <class Real> struct Footprints {
-  int32_t voxel[8][kLanes];
-  Real weight[8][kLanes];
-  int32_t least[kLanes];  // of the 8 indices: not negative where every corner is stored
-};
-
-// Positions u[axis] of kLanes points -> footprints.
-template <class Real>
-SURFCAP_HD void locate(const Grid<Real>& grid, const Pack<Real, kLanes> (&u)[3], Footprints<Real>& out) {
+// What kLanes points, at the positions u[axis], read: a 2 x 2 x 2 block of voxels each. Corner c is the upper one along
+// x where c has bit 2, along y where it has bit 1, along z where it has bit 0.
+template <class Real> struct Corners {
   using Index = Pack<int32_t, kLanes>;
   using Number = Pack<Real, kLanes>;
-  const int32_t stride[3] = {grid.n[1] * grid.n[2], grid.n[2], 1};
-  const int32_t inner[3] = {kTile * kTile, kTile, 1};
-  const Index none = fill_pack<int32_t, kLanes>(0);
-  const Number zero = zero_pack<Real, kLanes>(), one = fill_pack<Real, kLanes>(Real(1));
-  Index tile[3][2], local[3][2];  // of the lower and the upper corner along each axis
+  Index tile[3][2], local[3][2];  // of the lower and the upper voxels along each axis
   Number weight[3][2];
-  for (int axis = 0; axis < 3; ++axis) {
-    const Index last = fill_pack<int32_t, kLanes>(kTile * (grid.n[axis] - 1) - 1);
-    Index base = convert_pack<int32_t, kLanes, Real>(u[axis]);
-    base = smaller_pack<int32_t, kLanes>(larger_pack<int32_t, kLanes>(base, none), last);
-    const Number f = u[axis] - convert_pack<Real, kLanes, int32_t>(base);
-    weight[axis][1] = smaller_pack<Real, kLanes>(larger_pack<Real, kLanes>(f, zero), one);
-    weight[axis][0] = one - weight[axis][1];
-    for (int side = 0; side < 2; ++side) {
-      tile[axis][side] = ((base + side) >> 2) * stride[axis];
-      local[axis][side] = ((base + side) & 3) * inner[axis];
+
+  SURFCAP_HD Corners(const Grid<Real>& grid, const Number (&u)[3]) {
+    const int32_t stride[3] = {grid.n[1] * grid.n[2], grid.n[2], 1};
+    const int32_t inner[3] = {kTile * kTile, kTile, 1};
+    const Index none = fill_pack<int32_t, kLanes>(0);
+    const Number zero = zero_pack<Real, kLanes>(), one = fill_pack<Real, kLanes>(Real(1));
+    for (int axis = 0; axis < 3; ++axis) {
+      const Index last = fill_pack<int32_t, kLanes>(kTile * (grid.n[axis] - 1) - 1);
+      Index base = convert_pack<int32_t, kLanes, Real>(u[axis]);
+      base = smaller_pack<int32_t, kLanes>(larger_pack<int32_t, kLanes>(base, none), last);
+      const Number f = u[axis] - convert_pack<Real, kLanes, int32_t>(base);
+      weight[axis][1] = smaller_pack<Real, kLanes>(larger_pack<Real, kLanes>(f, zero), one);
+      weight[axis][0] = one - weight[axis][1];
+      for (int side = 0; side < 2; ++side) {
+        tile[axis][side] = ((base + side) >> 2) * stride[axis];
+        local[axis][side] = ((base + side) & 3) * inner[axis];
+      }
     }
   }
-  Index least = fill_pack<int32_t, kLanes>(0);
-  for (int c = 0; c < 8; ++c) {
-    const int cx = c >> 2, cy = (c >> 1) & 1, cz = c & 1;
-    const Index t = look_up<kLanes>(grid.table, tile[0][cx] + tile[1][cy] + tile[2][cz]);
-    // A stored tile has voxel >= t, a missing one (t < 0) voxel <= t: the greater is the index, or t's own meaning.
-    const Index voxel = t * kTileVoxels + (local[0][cx] + local[1][cy] + local[2][cz]);
-    store<int32_t, kLanes>(out.voxel[c], larger_pack<int32_t, kLanes>(t, voxel));
-    least = smaller_pack<int32_t, kLanes>(least, t);
-    store<Real, kLanes>(out.weight[c], weight[0][cx] * weight[1][cy] * weight[2][cz]);
+
+  // The voxel's index at corner c, or, where it has no tile, the entry of the table; this one in `entry` in any case.
+  SURFCAP_HD Index voxel(const Grid<Real>& grid, int c, Index& entry) const {
+    entry = look_up<kLanes>(grid.table, at(tile[0], c >> 2) + at(tile[1], c >> 1) + at(tile[2], c));
+    // A stored tile has voxel >= entry, a missing one (entry < 0) voxel <= entry: the greater is what is wanted.
+    const Index index = entry * kTileVoxels + (at(local[0], c >> 2) + at(local[1], c >> 1) + at(local[2], c));
+    return larger_pack<int32_t, kLanes>(entry, index);
   }
-  store<int32_t, kLanes>(out.least, least);
+
+  // The trilinear weight of corner c.
+  SURFCAP_HD Number share(int c) const { return at(weight[0], c >> 2) * at(weight[1], c >> 1) * at(weight[2], c); }
+
+ private:
+  // A choice, not an index: on CUDA c is known at run time only, and these arrays live in registers.
+  template <class P> SURFCAP_HD static const P& at(const P (&pair)[2], int bit) { return bit & 1 ? pair[1] : pair[0]; }
+};
+
+// A world position in voxel-centre units.
+template <class Real, class Number> SURFCAP_HD Number in_voxels(const Grid<Real>& grid, int axis, const Number& x) {
+  return (x - grid.origin[axis]) * grid.per_unit - Real(0.5);
 }
 
-// Asks for the records that the first `count` lanes will read from, or add to, `records`. On CUDA the many threads of a
-// multiprocessor hide the wait instead.
-template <int Degree, class Number, class Real>
-SURFCAP_HD void prefetch(const Number* records, const Footprints<Real>& at, int count) {
-#if !defined(__CUDACC__)
-  using R = Record<Degree>;
-  constexpr int kLine = 64 / sizeof(Number);
-  // Small records of one column along z share a cache line most of the time.
-  constexpr int kStride = R::kPitch * 2 <= kLine ? 2 : 1;
-  for (int l = 0; l < count; ++l)
-    for (int c = 0; c < 8; c += kStride)  // a negative index asks for a line before the records: a hint, no access
-      for (int i = 0; i < R::kPitch; i += kLine) __builtin_prefetch(records + int64_t(at.voxel[c][l]) * R::kPitch + i);
-#endif
-}
-
-// The trilinear read of lane l: sum of weight times record over the 8 corners. A missing corner is black and has the
-// boundary's opacity value: it reads a constant record instead.
-template <class Real, int Degree, class Stored>
-SURFCAP_HD Coefficients<Real, Degree> interpolate(const Field<Real, Stored>& field,
-                                                  const Code<Real, Degree, Stored>& code, const Footprints<Real>& at,
-                                                  int l) {
-  using R = Record<Degree>;
-  Coefficients<Real, Degree> sum;
-  for (int p = 0; p < R::kParts; ++p) sum.part[p] = zero_pack<Real, R::kPart>();
-  const auto add = [&](const Stored* record, Real weight) {
-    for (int p = 0; p < R::kParts; ++p) sum.part[p] += weight * load_as<Real, R::kPart>(record + p * R::kPart);
-  };
-  if (at.least[l] >= 0) {
-    for (int c = 0; c < 8; ++c) add(field.voxels + int64_t(at.voxel[c][l]) * R::kPitch, at.weight[c][l]);
-  } else {
-    for (int c = 0; c < 8; ++c) {
-      const int32_t voxel = at.voxel[c][l];
-      add(voxel >= 0 ? field.voxels + int64_t(voxel) * R::kPitch : code.missing + (voxel == kInside ? R::kPitch : 0),
-          at.weight[c][l]);
-    }
-  }
-  for (int p = 0; p < R::kParts; ++p) sum.part[p] = code.decode(sum.part[p], p);
-  return sum;
-}
-
-// The adjoint of interpolate: adds weight times gradient to the 8 corners' records; missing corners have no gradient
-// and are sent to a spare record.
-template <class Real, int Degree, class Sum>
-SURFCAP_HD void scatter(Sum* gradient, Sum* spare, const Footprints<Real>& at, int l, Coefficients<Real, Degree> g) {
-  using R = Record<Degree>;
-  for (int p = 0; p < R::kParts; ++p) g.part[p] = Real(kSumScale<Sum>) * g.part[p];
-  const auto add = [&](Sum* record, Real weight) {
-    for (int p = 0; p < R::kParts; ++p) add_to<Real, R::kPart>(record + p * R::kPart, weight * g.part[p]);
-  };
-  if (at.least[l] >= 0) {
-    for (int c = 0; c < 8; ++c) add(gradient + int64_t(at.voxel[c][l]) * R::kPitch, at.weight[c][l]);
-  } else {
-    for (int c = 0; c < 8; ++c) {
-      const int32_t voxel = at.voxel[c][l];
-      add(voxel >= 0 ? gradient + int64_t(voxel) * R::kPitch : spare, at.weight[c][l]);
-    }
-  }
+// The world position of voxel v of a tile, along one axis.
+template <class Real> SURFCAP_HD Real center_of(const Grid<Real>& grid, const int32_t* tile, int v, int axis) {
+  const int place = (v >> (4 - 2 * axis)) & 3;
+  return grid.origin[axis] + (Real(kTile * tile[axis] + place) + Real(0.5)) / grid.per_unit;
 }
 
 }  // namespace SURFCAP_ISA

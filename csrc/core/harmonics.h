@@ -15,7 +15,11 @@ template <int Degree> struct Record {
   static constexpr int kBasis = (Degree + 1) * (Degree + 1);
   static constexpr int kCoefficients = 1 + 3 * kBasis;
   static constexpr int kPitch = Degree == 0 ? 4 : Degree == 1 ? 16 : 32;
+#if defined(SURFCAP_CUDA)
+  static constexpr int kPart = 4;  // numbers per pack: what a thread loads at once
+#else
   static constexpr int kPart = kPitch < 16 ? kPitch : 16;  // numbers per pack
+#endif
   static constexpr int kParts = kPitch / kPart;
 };
 
@@ -52,24 +56,42 @@ template <class Real, int Degree> SURFCAP_HD Coefficients<Real, Degree> basis_we
   return w;
 }
 
-#if defined(__CUDACC__)
+#if defined(SURFCAP_CUDA)
+// The four numbers of part p stand, from p = 1 on, for the channels p + 2, p, p + 1, p + 2 (mod 3, r = 0), those of
+// part 0 for opacity, r, g, b. Their sum by channel:
+template <class Real> SURFCAP_HD Pack<Real, 4> fold_part(const Pack<Real, 4>& v, int p) {
+  const Real x = v[1], y = v[2], z = p == 0 ? v[3] : v[3] + v[0];  // channels p, p + 1, p + 2
+  const int turn = p % 3;
+  Pack<Real, 4> sum;
+  sum[0] = p == 0 ? v[0] : Real(0);
+  sum[1] = turn == 0 ? x : turn == 1 ? z : y;
+  sum[2] = turn == 0 ? y : turn == 1 ? x : z;
+  sum[3] = turn == 0 ? z : turn == 1 ? y : x;
+  return sum;
+}
+
+// Its transpose.
+template <class Real> SURFCAP_HD Pack<Real, 4> unfold_part(const Pack<Real, 4>& g, int p) {
+  const int turn = p % 3;
+  Pack<Real, 4> v;
+  v[1] = turn == 0 ? g[1] : turn == 1 ? g[2] : g[3];
+  v[2] = turn == 0 ? g[2] : turn == 1 ? g[3] : g[1];
+  v[3] = turn == 0 ? g[3] : turn == 1 ? g[1] : g[2];
+  v[0] = p == 0 ? g[0] : v[3];
+  return v;
+}
+
 template <class Real, int Degree>
 SURFCAP_HD Pack<Real, 4> fold(const Coefficients<Real, Degree>& c, const Coefficients<Real, Degree>& w) {
-  using R = Record<Degree>;
   Pack<Real, 4> sum = zero_pack<Real, 4>();
-#pragma unroll
-  for (int i = 0; i < R::kCoefficients; ++i)
-    sum[i == 0 ? 0 : 1 + (i - 1) % 3] += c.part[i / R::kPart][i % R::kPart] * w.part[i / R::kPart][i % R::kPart];
+  for (int p = 0; p < Record<Degree>::kParts; ++p) sum += fold_part<Real>(c.part[p] * w.part[p], p);
   return sum;
 }
 
 template <class Real, int Degree>
 SURFCAP_HD Coefficients<Real, Degree> unfold(const Pack<Real, 4>& g, const Coefficients<Real, Degree>& w) {
-  using R = Record<Degree>;
   Coefficients<Real, Degree> r;
-#pragma unroll
-  for (int i = 0; i < R::kPitch; ++i)
-    r.part[i / R::kPart][i % R::kPart] = g[i == 0 ? 0 : 1 + (i - 1) % 3] * w.part[i / R::kPart][i % R::kPart];
+  for (int p = 0; p < Record<Degree>::kParts; ++p) r.part[p] = w.part[p] * unfold_part<Real>(g, p);
   return r;
 }
 #else

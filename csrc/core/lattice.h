@@ -17,7 +17,7 @@ template <class Real> struct Line {
     origin = zero_pack<Real, 4>();
     direction = fill_pack<Real, 4>(Real(1));
     for (int i = 0; i < 3; ++i) {
-      origin[i] = (o[i] - grid.origin[i]) * grid.per_unit - Real(0.5);
+      origin[i] = in_voxels(grid, i, o[i]);
       const Real slope = d[i] * grid.per_unit;
       direction[i] = slope < kHair && slope > -kHair ? kHair : slope;
     }

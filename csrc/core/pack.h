@@ -6,13 +6,14 @@
 
 #include "views.h"
 
-#if defined(__x86_64__) && !defined(__CUDACC__)
+#if defined(SURFCAP_CUDA)
+#include <cuda_runtime.h>
+#define SURFCAP_HD __host__ __device__ __forceinline__
+#define SURFCAP_ISA cuda
+#else
+#if defined(__x86_64__)
 #include <immintrin.h>
 #endif
-
-#if defined(__CUDACC__)
-#define SURFCAP_HD __host__ __device__ __forceinline__
-#else
 #define SURFCAP_HD inline __attribute__((always_inline))
 #endif
 
@@ -23,8 +24,9 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-#if defined(__CUDACC__)
-template <class Real, int N> struct PackStruct {
+#if defined(SURFCAP_CUDA)
+// As aligned as the widest load of its size, so that `load_aligned` is one instruction.
+template <class Real, int N> struct alignas(N * sizeof(Real) > 16 ? 16 : N * sizeof(Real)) PackStruct {
   Real lane[N];
   SURFCAP_HD Real& operator[](int i) { return lane[i]; }
   SURFCAP_HD Real operator[](int i) const { return lane[i]; }
@@ -44,11 +46,20 @@ template <class Real, int N> struct PackStruct {
     for (int i = 0; i < N; ++i) r.lane[i] = a.lane[i] op b;                            \
     return r;                                                                          \
   }                                                                                    \
-  SURFCAP_HD PackStruct& operator op## = (const PackStruct& b) { return *this = *this op b; }
+  SURFCAP_HD PackStruct& operator op##=(const PackStruct& b) { return *this = *this op b; }
   SURFCAP_PACK_OPERATOR(+)
   SURFCAP_PACK_OPERATOR(-)
   SURFCAP_PACK_OPERATOR(*)
+  SURFCAP_PACK_OPERATOR(/)
 #undef SURFCAP_PACK_OPERATOR
+  friend SURFCAP_HD PackStruct operator>>(PackStruct a, int bits) {
+    for (int i = 0; i < N; ++i) a.lane[i] >>= bits;
+    return a;
+  }
+  friend SURFCAP_HD PackStruct operator&(PackStruct a, Real bits) {
+    for (int i = 0; i < N; ++i) a.lane[i] &= bits;
+    return a;
+  }
 };
 template <class Real, int N> struct PackOf {
   using type = PackStruct<Real, N>;
@@ -69,7 +80,7 @@ template <class Real, int N> SURFCAP_HD Pack<Real, N> fill_pack(Real x) {
 
 template <class Real, int N> SURFCAP_HD Pack<Real, N> zero_pack() { return fill_pack<Real, N>(Real(0)); }
 
-// Unaligned load and store of N consecutive numbers. memcpy of a whole register compiles to one move.
+// Unaligned load and store of N consecutive numbers. On the CPU memcpy of a whole register compiles to one move.
 template <class Real, int N> SURFCAP_HD Pack<Real, N> load(const Real* from) {
   Pack<Real, N> p;
   __builtin_memcpy(&p, from, sizeof(p));
@@ -80,9 +91,26 @@ template <class Real, int N> SURFCAP_HD void store(Real* to, const Pack<Real, N>
   __builtin_memcpy(to, &p, sizeof(p));
 }
 
+// The same of memory as aligned as the pack, which records are.
+template <class Real, int N> SURFCAP_HD Pack<Real, N> load_aligned(const Real* from) {
+#if defined(SURFCAP_CUDA)
+  return *reinterpret_cast<const Pack<Real, N>*>(from);
+#else
+  return load<Real, N>(from);
+#endif
+}
+
+template <class Real, int N> SURFCAP_HD void store_aligned(Real* to, const Pack<Real, N>& p) {
+#if defined(SURFCAP_CUDA)
+  *reinterpret_cast<Pack<Real, N>*>(to) = p;
+#else
+  store<Real, N>(to, p);
+#endif
+}
+
 // Lane by lane: truncation to integers, integers to numbers, the lesser and the greater of two packs.
 template <class To, int N, class From> SURFCAP_HD Pack<To, N> convert_pack(const Pack<From, N>& from) {
-#if defined(__CUDACC__)
+#if defined(SURFCAP_CUDA)
   Pack<To, N> to;
   for (int i = 0; i < N; ++i) to[i] = To(from[i]);
   return to;
@@ -92,7 +120,7 @@ template <class To, int N, class From> SURFCAP_HD Pack<To, N> convert_pack(const
 }
 
 template <class T, int N> SURFCAP_HD Pack<T, N> smaller_pack(const Pack<T, N>& a, const Pack<T, N>& b) {
-#if defined(__CUDACC__)
+#if defined(SURFCAP_CUDA)
   Pack<T, N> r;
   for (int i = 0; i < N; ++i) r[i] = a[i] < b[i] ? a[i] : b[i];
   return r;
@@ -102,7 +130,7 @@ template <class T, int N> SURFCAP_HD Pack<T, N> smaller_pack(const Pack<T, N>& a
 }
 
 template <class T, int N> SURFCAP_HD Pack<T, N> larger_pack(const Pack<T, N>& a, const Pack<T, N>& b) {
-#if defined(__CUDACC__)
+#if defined(SURFCAP_CUDA)
   Pack<T, N> r;
   for (int i = 0; i < N; ++i) r[i] = a[i] > b[i] ? a[i] : b[i];
   return r;

@@ -28,24 +28,22 @@ template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const uint8_t* slot) {
   return convert_pack<Real, 4, float>(decode_e5m2<4>(slot));
 }
 
-// Writes the samples' gradients into their rays' rows, which are cleared first: a ray may end before its row does.
-// Memory rule: writes.
-template <class Real, class Slot> struct ToSlots {
-  const SlotRows<Real>& rows;
-  Slot* slots;  // [S, 4]
+// One ray's row. Memory rule: writes; it is cleared first, for a ray may end before its row does.
+template <class Real, class Slot> struct SlotRow {
+  Slot* row;  // [count, 4]
+  int64_t count;
+  int32_t first;
+  Real scale;
 
-  static constexpr const Real* prefetched() { return nullptr; }
+  SURFCAP_HD SlotRow(const SlotRows<Real>& rows, Slot* slots, int64_t ray)
+      : row(slots + 4 * rows.starts[ray]),
+        count(rows.starts[ray + 1] - rows.starts[ray]),
+        first(rows.first[ray]),
+        scale(rows.scale) {}
 
-  template <class Walk> SURFCAP_HD auto sink(const Walk&, int64_t ray) const {
-    Slot* const row = slots + 4 * rows.starts[ray];
-    const int64_t count = rows.starts[ray + 1] - rows.starts[ray];
-    const int32_t first = rows.first[ray];
-    const Real scale = rows.scale;
-    for (int64_t i = 0; i < 4 * count; ++i) row[i] = Slot(0);
-    return [=](int, const auto& sample, const Pack<Real, 4>& g) {
-      const int64_t at = int64_t(sample.k) - first;
-      if (at >= 0 && at < count) store_slot<Real>(row + 4 * at, scale * g);
-    };
+  SURFCAP_HD void put(int32_t k, const Pack<Real, 4>& g) const {
+    const int64_t at = int64_t(k) - first;
+    if (at >= 0 && at < count) store_slot<Real>(row + 4 * at, scale * g);
   }
 };
 
@@ -91,7 +89,7 @@ SURFCAP_HD void find_stand(const Grid<Real>& field, const int32_t* coordinate, i
   const Index column = along(h[0], window[0], width, out.right), row = along(h[1], window[1], height, out.down);
   const Number squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2];
   const Real filling = determinant * voxel * voxel * voxel / cameras.step;
-  const int64_t blocks = ((width - 1) >> kReachBits) + 1;
+  const int64_t blocks = blocks_along(width);
   for (int l = 0; l < kLanes; ++l) {
     const Real distance = std::sqrt(squared[l]), depth = h[2][l];
     const Real k = larger(distance / cameras.step - Real(0.5) - cameras.shift[v], Real(0));
@@ -138,62 +136,33 @@ SURFCAP_HD int find_shares(const Stand<Real>& stand, int first, int64_t width, c
   return found;
 }
 
-// Fills the reach of one camera's window; `reach` is that of its first block.
-template <class Real>
-SURFCAP_HD void find_reach(const SlotCameras<Real>& cameras, const SlotRows<Real>& rows, int64_t v, int32_t* reach) {
-  const int64_t width = cameras.windows[4 * v + 2], height = cameras.windows[4 * v + 3];
-  const int64_t wide = ((width - 1) >> kReachBits) + 1, high = ((height - 1) >> kReachBits) + 1;
-  const int32_t* const rays = cameras.rays + cameras.offsets[v];
-  for (int64_t b = 0; b < wide * high; ++b, reach += 2) {
-    reach[0] = INT_MAX;
-    reach[1] = INT_MIN;
-    const int64_t left = (b % wide) << kReachBits, top = (b / wide) << kReachBits, side = (1 << kReachBits) + 1;
-    for (int64_t y = top; y < smaller(top + side, height); ++y)
-      for (int64_t x = left; x < smaller(left + side, width); ++x) {
-        const int32_t ray = rays[y * width + x];
-        if (ray < 0 || rows.starts[ray] == rows.starts[ray + 1]) continue;
-        reach[0] = smaller(reach[0], rows.first[ray]);
-        reach[1] = larger(reach[1], int32_t(rows.first[ray] + rows.starts[ray + 1] - rows.starts[ray]));
-      }
-  }
+// The gradient of the record of the stand's voxel l, which has read `read` from one camera's slots.
+template <class Real, int Degree>
+SURFCAP_HD Coefficients<Real, Degree> by_record(const Stand<Real>& stand, int l, const SlotRows<Real>& rows,
+                                                const Pack<Real, 4>& read) {
+  const Real nearness = Real(1) / stand.distance[l];
+  const Real direction[3] = {stand.way[0][l] * nearness, stand.way[1][l] * nearness, stand.way[2][l] * nearness};
+  return unfold<Real, Degree>(stand.samples[l] / rows.scale * read, basis_weights<Real, Degree>(direction));
 }
 
-// The gradient of one tile's voxels, all cameras in their order. Memory rule: writes `gradient` [4, 4, 4, pitch].
-template <class Real, int Degree, class Slot>
-SURFCAP_HD void gather_tile(const Grid<Real>& field, const int32_t* coordinate, const SlotCameras<Real>& cameras,
-                            const SlotRows<Real>& rows, const Slot* slots, Real* gradient) {
-  using R = Record<Degree>;
-  Stand<Real> stands[kTileVoxels / kLanes];
-  Share<Real> shares[4 * kTileVoxels + 1];
-  Pack<Real, 4> read[kTileVoxels];
-  for (int i = 0; i < kTileVoxels * R::kPitch; ++i) gradient[i] = Real(0);
-  for (int64_t v = 0; v < cameras.views; ++v) {
-    const int64_t width = cameras.windows[4 * v + 2];
-    if (width == 0) continue;
-    int count = 0;
-    for (int first = 0; first < kTileVoxels; first += kLanes) {
-      Stand<Real>& stand = stands[first / kLanes];
-      find_stand(field, coordinate, first, cameras, v, stand);
-      const int found = find_shares(stand, first, width, rows, shares + count);
-      for (const int end = count + found; count < end; ++count) __builtin_prefetch(slots + 4 * shares[count].before);
+// The reach of the b-th block of camera v's window.
+template <class Real>
+SURFCAP_HD void find_reach(const SlotCameras<Real>& cameras, const SlotRows<Real>& rows, int64_t v, int64_t b,
+                           int32_t* reach) {
+  const int64_t width = cameras.windows[4 * v + 2], height = cameras.windows[4 * v + 3];
+  const int32_t* const rays = cameras.rays + cameras.offsets[v];
+  const int64_t wide = blocks_along(width), side = (1 << kReachBits) + 1;
+  const int64_t left = (b % wide) << kReachBits, top = (b / wide) << kReachBits;
+  int32_t least = INT_MAX, most = INT_MIN;
+  for (int64_t y = top; y < smaller(top + side, height); ++y)
+    for (int64_t x = left; x < smaller(left + side, width); ++x) {
+      const int32_t ray = rays[y * width + x];
+      if (ray < 0 || rows.starts[ray] == rows.starts[ray + 1]) continue;
+      least = smaller(least, rows.first[ray]);
+      most = larger(most, int32_t(rows.first[ray] + rows.starts[ray + 1] - rows.starts[ray]));
     }
-    if (count == 0) continue;
-    for (int i = 0; i < kTileVoxels; ++i) read[i] = zero_pack<Real, 4>();
-    for (int s = 0; s < count; ++s)
-      read[shares[s].voxel] += shares[s].weight_before * load_slot<Real>(slots + 4 * shares[s].before) +
-                               shares[s].weight_after * load_slot<Real>(slots + 4 * shares[s].after);
-    for (int i = 0; i < kTileVoxels; ++i) {
-      const Stand<Real>& stand = stands[i / kLanes];
-      const int l = i % kLanes;
-      const Real nearness = Real(1) / stand.distance[l];
-      const Real direction[3] = {stand.way[0][l] * nearness, stand.way[1][l] * nearness, stand.way[2][l] * nearness};
-      const Coefficients<Real, Degree> by_record =
-          unfold<Real, Degree>(stand.samples[l] / rows.scale * read[i], basis_weights<Real, Degree>(direction));
-      Real* const to = gradient + i * R::kPitch;
-      for (int p = 0; p < R::kParts; ++p)
-        store<Real, R::kPart>(to + p * R::kPart, load<Real, R::kPart>(to + p * R::kPart) + by_record.part[p]);
-    }
-  }
+  reach[0] = least;
+  reach[1] = most;
 }
 
 }  // namespace SURFCAP_ISA

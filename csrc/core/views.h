@@ -1,8 +1,13 @@
-// What the drivers hand to the mathematics: plain views of tensors and plain settings, without a function, so that they
-// are the same types for every instruction set. Pointers are row-major and contiguous.
+// What the drivers hand to the mathematics: plain views of tensors and plain settings, so that they are the
+// same types for every instruction set. Pointers are row-major and contiguous.
 #pragma once
 
 #include <cstdint>
+
+// SURFCAP_CUDA: this is compiled for CUDA's threads, by nvcc or, in the tests, by a C++ compiler that emulates them.
+#if defined(__CUDACC__) || defined(SURFCAP_CUDA_EMULATION)
+#define SURFCAP_CUDA
+#endif
 
 namespace surfcap {
 
@@ -99,6 +104,9 @@ template <class Real> struct SlotCameras {
 };
 
 constexpr int kReachBits = 3;
+
+// Blocks along a window's side of so many pixels.
+constexpr int64_t blocks_along(int64_t size) { return size > 0 ? ((size - 1) >> kReachBits) + 1 : 0; }
 
 template <class Real> struct VoxelTerms {
   Real tv_opacity, tv_color, parsimony, ballooning, curvature;  // weights

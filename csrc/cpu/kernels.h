@@ -22,7 +22,7 @@ template <class Real> struct Kernels {
   void (*march_backward)(const Field<Real>&, const Rays<Real>&, const RaySettings<Real>&, const Real* grad_color,
                          const Real* grad_transmittance, const Real* grad_depth, int64_t begin, int64_t end,
                          Real* gradient);
-  void (*find_reach)(const SlotCameras<Real>&, const SlotRows<Real>&, int64_t view, int32_t* reach);
+  void (*reach_of_view)(const SlotCameras<Real>&, const SlotRows<Real>&, int64_t view, int32_t* reach);
   // The slots are Real or, where `narrow`, 8-bit floats.
   void (*gather_gradient)(const Grid<Real>&, const int32_t* coordinates, const SlotCameras<Real>&,
                           const SlotRows<Real>&, bool narrow, const void* slots, int64_t begin, int64_t end,

@@ -1,23 +1,14 @@
 // The body of the kernel tables, compiled once per instruction set by isa_*.cpp, which set SURFCAP_ISA and the target.
 #include "../core/adam.h"
-#include "../core/rays.h"
+#include "../core/choices.h"
 #include "../core/silhouettes.h"
 #include "../core/voxels.h"
+#include "gather.h"
 #include "kernels.h"
+#include "walk.h"
 
 namespace surfcap {
 inline namespace SURFCAP_ISA {
-
-template <int N> struct Constant {
-  static constexpr int value = N;
-};
-
-// Calls f with the spherical harmonics' degree as a constant.
-template <class F> void with_degree(int32_t pitch, const F& f) {
-  if (pitch == Record<0>::kPitch) f(Constant<0>{});
-  if (pitch == Record<1>::kPitch) f(Constant<1>{});
-  if (pitch == Record<2>::kPitch) f(Constant<2>{});
-}
 
 // Memory that a thread keeps between calls, aligned to a cache line.
 class Workspace {
@@ -44,7 +35,7 @@ static thread_local Workspace workspace;
 template <class Real, class Stored, class F>
 void with_marcher(const Field<Real, Stored>& field, const RaySettings<Real>& settings, const F& f) {
   const int64_t capacity = trace_capacity(field, settings.step);
-  const auto with_opacity = [&](const auto& opacity) {
+  with_opacity(settings, [&](const auto& opacity) {
     using Opacity = std::decay_t<decltype(opacity)>;
     const size_t room = capacity * kBundle, sample_bytes = room * sizeof(Sample<Real, Opacity>);
     char* memory = workspace.reserve(sample_bytes + room / kLanes * sizeof(Footprints<Real>) + 64);
@@ -54,18 +45,18 @@ void with_marcher(const Field<Real, Stored>& field, const RaySettings<Real>& set
     with_degree(field.pitch, [&](auto degree) {
       f(Marcher<Real, decltype(degree)::value, Opacity, Stored>(field, settings, opacity, trace));
     });
-  };
-  if (settings.opacity == 0)
-    with_opacity(Transparency<Real>{});
-  else
-    with_opacity(SignedDistance<Real>{settings.slope});
+  });
 }
 
 template <class Real>
 void march_forward(const Field<Real>& field, const Rays<Real>& rays, const RaySettings<Real>& settings, int64_t begin,
                    int64_t end, const Rendering<Real>& out) {
   with_marcher(field, settings, [&](const auto& march) {
-    for (int64_t i = begin; i < end; ++i) render_ray(march, rays, i, out);
+    typename std::decay_t<decltype(march)>::Walk walk;
+    for (int64_t i = begin; i < end; ++i) {
+      march.walk(walk, rays, i);
+      write_ray(walk.ray, rays.background, i, out);
+    }
   });
 }
 
@@ -76,8 +67,11 @@ void march_backward(const Field<Real>& field, const Rays<Real>& rays, const RayS
   Real spare[32] = {};
   with_marcher(field, settings, [&]<int Degree, class Opacity>(const Marcher<Real, Degree, Opacity>& march) {
     const ToVoxels<Real, Degree> to{gradient, spare};
-    for (int64_t i = begin; i < end; ++i)
-      render_ray_backward(march, rays, i, grad_color, grad_transmittance, grad_depth, to);
+    typename Marcher<Real, Degree, Opacity>::Walk walk;
+    for (int64_t i = begin; i < end; ++i) {
+      march.walk(walk, rays, i, to.prefetched());
+      adjoint_ray(walk.ray, rays, i, grad_color, grad_transmittance, grad_depth, march.back(walk, i, to));
+    }
   });
 }
 
@@ -92,14 +86,6 @@ void photometric_step(const Field<Real, Stored>& field, const Rays<Real>& rays, 
   });
 }
 
-// Calls f with the slots as what they are.
-template <class Real, class F> void with_slots(bool narrow, const void* slots, const F& f) {
-  if (narrow)
-    f(static_cast<const uint8_t*>(slots));
-  else
-    f(static_cast<const Real*>(slots));
-}
-
 template <class Real, class Stored>
 void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
                          const Observation<Real>& seen, const PhotometricSettings<Real>& loss,
@@ -110,6 +96,13 @@ void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& ray
     with_marcher(field, settings,
                  [&](const auto& march) { photometric_rays(march, rays, seen, loss, begin, end, losses, out, to); });
   });
+}
+
+template <class Real>
+void reach_of_view(const SlotCameras<Real>& cameras, const SlotRows<Real>& rows, int64_t view, int32_t* reach) {
+  const int64_t blocks =
+      blocks_along(cameras.windows[4 * view + 2]) * blocks_along(cameras.windows[4 * view + 3]);
+  for (int64_t b = 0; b < blocks; ++b) find_reach(cameras, rows, view, b, reach + 2 * b);
 }
 
 template <class Real>
@@ -138,11 +131,16 @@ template <class Sum> void add_sums(Sum* total, const Sum* more, int64_t begin, i
 template <class Real, class Stored>
 void integration_ranges(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
                         Real quiet, int64_t begin, int64_t end, int64_t* counts, std::vector<Real>& ranges) {
-  std::vector<Real> room(2 * trace_capacity(field, settings.step));
   with_marcher(field, settings, [&](const auto& march) {
+    typename std::decay_t<decltype(march)>::Walk walk;
     for (int64_t i = begin; i < end; ++i) {
-      counts[i] = ray_ranges(march, rays, i, quiet, room.data());
-      ranges.insert(ranges.end(), room.data(), room.data() + 2 * counts[i]);
+      march.walk(walk, rays, i);
+      const size_t before = ranges.size();
+      const auto to = [&](int n, Real from, Real until) {
+        ranges.resize(before + 2 * n);
+        ranges.insert(ranges.end(), {from, until});
+      };
+      counts[i] = ray_ranges(walk.trace.samples, walk.ray.samples, settings.step, quiet, to);
     }
   });
 }
@@ -175,7 +173,7 @@ void for_points(const Field<Real>& field, int64_t begin, int64_t end, const Poin
     }
     Pack<Real, kLanes> u[3];
     for (int axis = 0; axis < 3; ++axis)
-      u[axis] = (load<Real, kLanes>(x[axis]) - field.origin[axis]) * field.per_unit - Real(0.5);
+      u[axis] = in_voxels(field, axis, load<Real, kLanes>(x[axis]));
     Footprints<Real> at;
     locate(field, u, at);
     f(at, count, first);
@@ -259,22 +257,47 @@ template <class Real>
 void upscale(const Field<Real>& coarse, const Field<Real>& fine, const int32_t* coordinates, int64_t begin, int64_t end,
              Real* voxels) {
   const auto center = [&](int64_t i, Real* x) {
-    const int v = int(i % kTileVoxels), place[3] = {v / (kTile * kTile), (v / kTile) % kTile, v % kTile};
-    for (int axis = 0; axis < 3; ++axis) {
-      const Real voxel = Real(kTile * coordinates[i / kTileVoxels * 3 + axis] + place[axis]) + Real(0.5);
-      x[axis] = fine.origin[axis] + voxel / fine.per_unit;
-    }
+    for (int axis = 0; axis < 3; ++axis)
+      x[axis] = center_of(fine, coordinates + i / kTileVoxels * 3, int(i % kTileVoxels), axis);
   };
   read_points(coarse, begin * kTileVoxels, end * kTileVoxels, center, voxels);
+}
+
+// Adds the gradient of the curvature term to the opacity values of a tile, and returns the term's share of its voxels.
+template <class Real, class Stored, class Sum>
+Real curvature_tile(const Field<Real, Stored>& field, int64_t cell, int64_t tile, Real weight, Real eps,
+                    Sum* gradient) {
+  Real value[kHaloVoxels], bend[kHaloVoxels];
+  for (int x = 0; x < kHaloSide; ++x)
+    for (int y = 0; y < kHaloSide; ++y)
+      for (int z = 0; z < kHaloSide; ++z)
+        value[(x * kHaloSide + y) * kHaloSide + z] = halo_value(field, cell, x, y, z);
+  const Known<Real, Stored> known(field);
+  Real loss = Real(0);
+  for (int x = 1; x < kHaloSide - 1; ++x)
+    for (int y = 1; y < kHaloSide - 1; ++y) loss += known.bend(value, (x * kHaloSide + y) * kHaloSide, eps, bend);
+  for (int v = 0; v < kTileVoxels; v += kTile) {
+    const Pack<Real, kRun> by_value = Real(kSumScale<Sum>) * weight * laplacian(bend + in_halo(v) - kHalo);
+    for (int z = 0; z < kTile; ++z) add_to(gradient + (tile * kTileVoxels + v + z) * field.pitch, by_value[z + kHalo]);
+  }
+  return loss;
 }
 
 template <class Real, class Stored, class Sum>
 void voxel_terms(const Field<Real, Stored>& field, const int32_t* coordinates, const VoxelTerms<Real>& terms,
                  int64_t begin, int64_t end, double* losses, Sum* gradient) {
   with_degree(field.pitch, [&](auto degree) {
-    const Code<Real, decltype(degree)::value, Stored> code(field);
-    for (int64_t t = begin; t < end; ++t)
-      voxel_terms_tile(field, code, coordinates + 3 * t, terms, t, losses, gradient);
+    constexpr int D = decltype(degree)::value;
+    const Code<Real, D, Stored> code(field);
+    for (int64_t t = begin; t < end; ++t) {
+      const int64_t cell = cell_of(field, coordinates + 3 * t);
+      TermSums<D, Real> sums[Record<D>::kParts];
+      for (int v = 0; v < kTileVoxels; ++v)
+        for (int p = 0; p < Record<D>::kParts; ++p) sums[p].add(field, code, cell, terms, t, v, p, gradient);
+      for (int p = 0; p < Record<D>::kParts; ++p) sums[p].add_to_losses(p, losses);
+      if (terms.curvature != Real(0))
+        losses[4] += double(curvature_tile(field, cell, t, terms.curvature, terms.bend, gradient));
+    }
   });
 }
 
@@ -282,13 +305,21 @@ void voxel_terms(const Field<Real, Stored>& field, const int32_t* coordinates, c
 template <class Real, class Stored, class Sum>
 void adam_step(Stored* value, const Sum* gradient, MomentOf<Stored>* first, MomentOf<Stored>* second, int32_t pitch,
                int64_t begin, int64_t end, const AdamSettings<Real>& adam) {
-  const int64_t tile = int64_t(kTileVoxels) * pitch, at = begin * tile;
+  const int64_t tile = int64_t(kTileVoxels) * pitch, from = begin * tile, to = end * tile;
   with_degree(pitch, [&](auto degree) {
     constexpr int kPitch = Record<decltype(degree)::value>::kPitch;
-    if constexpr (std::is_same_v<Stored, Real>)
-      adam_records<Real, kPitch>(value + at, gradient + at, first + at, second + at, (end - begin) * kTileVoxels, adam);
-    else
-      adam_codes<kPitch>(value, gradient, first, second, at, end * tile, adam);
+    if constexpr (std::is_same_v<Stored, Real>) {
+      for (int64_t record = from; record < to; record += kPitch)
+        for (int i = 0; i < kPitch; ++i)
+          adam_number(value[record + i], gradient[record + i], first[record + i], second[record + i], adam.rate[i],
+                      adam.low[i], adam.high[i], adam);
+    } else {
+      constexpr int kRow = 16, kPeriod = kPitch < kRow ? kRow : kPitch;
+      float rates[kPeriod];
+      for (int i = 0; i < kPeriod; ++i) rates[i] = code_rate<Stored>(adam, i % kPitch);
+      for (int64_t at = from; at < to; at += kRow)
+        adam_codes<kRow>(value, gradient, first, second, at, load<float, kRow>(rates + at % kPeriod), adam);
+    }
   });
 }
 
@@ -303,7 +334,7 @@ template <class Table> struct Filled;
 template <class Real> struct Filled<Kernels<Real>> {
   static constexpr Kernels<Real> table{SURFCAP_ISA_NAME,     sample_forward<Real>, sample_backward<Real>,
                                        shade_forward<Real>,  shade_backward<Real>, march_forward<Real>,
-                                       march_backward<Real>, find_reach<Real>,     gather_gradient<Real>,
+                                       march_backward<Real>, reach_of_view<Real>,  gather_gradient<Real>,
                                        soft_hull<Real>,      upscale<Real>};
 };
 template <class Real, class Stored, class Sum> struct Filled<FitKernels<Real, Stored, Sum>> {

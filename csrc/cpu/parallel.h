@@ -15,6 +15,12 @@
 
 namespace surfcap {
 
+// The device that the drivers run on: the tensors of a call need no look, for the dispatcher comes here only with those
+// of the host. Ops add what they run to it.
+struct Host {
+  Host(const char*, std::initializer_list<Tensor>) {}
+};
+
 constexpr int64_t kChunk = 256;  // rays or points that one group takes at a time, to even out the load
 
 // Asks for large pages under a large buffer, before it is first touched: the march reads and writes it at random, and
@@ -52,23 +58,22 @@ void grouped(int64_t count, int64_t groups, int64_t size, Number* total, Number*
   });
 }
 
-// The same with buffers of its own for all groups but the first; no more groups than chunks.
+// The same into a tensor, with buffers of its own for all groups but the first; no more groups than chunks.
 template <class Real, class Work, class Combine>
-void grouped(const Tensor& like, int64_t count, int64_t groups, int64_t size, Real* total, const Work& work,
-             const Combine& combine) {
+void grouped(int64_t count, int64_t groups, const Tensor& total, const Work& work, const Combine& combine) {
   STD_TORCH_CHECK(groups >= 1, "groups: expected at least 1, got ", groups);
   groups = std::max<int64_t>(1, std::min(groups, (count + kChunk - 1) / kChunk));
-  const Tensor rest = torch::stable::new_empty(like, {groups - 1, size});
-  Real* const buffers = rest.template mutable_data_ptr<Real>();
-  advise_large_pages(total, size * int64_t(sizeof(Real)));
-  advise_large_pages(buffers, (groups - 1) * size * int64_t(sizeof(Real)));
-  grouped(count, groups, size, total, buffers, work, combine);
+  const int64_t size = total.numel();
+  const Tensor rest = torch::stable::new_empty(total, {groups - 1, size});
+  Real *const first = total.template mutable_data_ptr<Real>(), *const others = rest.template mutable_data_ptr<Real>();
+  advise_large_pages(first, size * int64_t(sizeof(Real)));
+  advise_large_pages(others, (groups - 1) * size * int64_t(sizeof(Real)));
+  grouped(count, groups, size, first, others, work, combine);
 }
 
 template <class Real, class Work>
-void grouped_sum(const Tensor& like, int64_t count, int64_t groups, int64_t size, Real* total, const Work& work) {
-  const auto add = best<FitKernels<Real, Real, Real>>().add_sums;
-  grouped(like, count, groups, size, total, work, add);
+void grouped_sum(int64_t count, int64_t groups, const Tensor& total, const Work& work) {
+  grouped<Real>(count, groups, total, work, best<FitKernels<Real, Real, Real>>().add_sums);
 }
 
 }  // namespace surfcap

@@ -1,47 +1,35 @@
-// sample_forward, sample_backward: the trilinear read of the tiles at points, and its adjoint.
+// sample_forward, sample_backward on the CPU.
+#include "../drivers/sample.h"
+
 #include "parallel.h"
 
 namespace surfcap {
+namespace {
 
-template <class Real>
-Tensor sample_forward_typed(const Tensor& voxels, const Tensor& table, const std::vector<double>& frame,
-                            const Tensor& points) {
-  const FieldArgument<Real> field(voxels, table, frame);
-  const Input<Real> at("points", points, {kAny, 3});
-  const Tensor values = torch::stable::new_empty(voxels, {points.size(0), field.view.pitch});
-  Real* const out = values.template mutable_data_ptr<Real>();
-  parallel_ranges(points.size(0), 1024, [&](int64_t begin, int64_t end) {
-    best_kernels<Real>().sample_forward(field.view, at.data(), begin, end, out);
-  });
-  return values;
-}
+struct Cpu : Host {
+  using Host::Host;
 
-template <class Real>
-Tensor sample_backward_typed(const Tensor& grad_values, const Tensor& voxels, const Tensor& table,
-                             const std::vector<double>& frame, const Tensor& points, int64_t groups) {
-  const FieldArgument<Real> field(voxels, table, frame);
-  const Input<Real> at("points", points, {kAny, 3});
-  const Input<Real> by_values("grad_values", grad_values, {points.size(0), field.view.pitch});
-  const Tensor gradient = torch::stable::empty_like(field.voxels.tensor());
-  grouped_sum<Real>(voxels, points.size(0), groups, gradient.numel(), gradient.template mutable_data_ptr<Real>(),
-                    [&](int64_t begin, int64_t end, Real* buffer, int64_t) {
-                      best_kernels<Real>().sample_backward(field.view, at.data(), by_values.data(), begin, end, buffer);
-                    });
-  return gradient;
-}
+  template <class Real>
+  void sample_forward(const Field<Real>& field, const Real* points, int64_t count, Real* values) const {
+    parallel_ranges(count, 1024, [&](int64_t begin, int64_t end) {
+      best_kernels<Real>().sample_forward(field, points, begin, end, values);
+    });
+  }
 
-Tensor sample_forward(Tensor voxels, Tensor table, std::vector<double> frame, Tensor points) {
-  return SURFCAP_BY_TYPE(voxels, sample_forward_typed, voxels, table, frame, points);
-}
+  template <class Real>
+  void sample_backward(const Field<Real>& field, const Real* points, const Real* grad_values, int64_t count,
+                       int64_t groups, const Tensor& gradient) const {
+    grouped_sum<Real>(count, groups, gradient, [&](int64_t begin, int64_t end, Real* buffer, int64_t) {
+      best_kernels<Real>().sample_backward(field, points, grad_values, begin, end, buffer);
+    });
+  }
+};
 
-Tensor sample_backward(Tensor grad_values, Tensor voxels, Tensor table, std::vector<double> frame, Tensor points,
-                       int64_t groups) {
-  return SURFCAP_BY_TYPE(voxels, sample_backward_typed, grad_values, voxels, table, frame, points, groups);
-}
+}  // namespace
 
 STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("sample_forward", TORCH_BOX(&sample_forward));
-  m.impl("sample_backward", TORCH_BOX(&sample_backward));
+  m.impl("sample_forward", TORCH_BOX(&sample_forward<Cpu>));
+  m.impl("sample_backward", TORCH_BOX(&sample_backward<Cpu>));
 }
 
 }  // namespace surfcap

@@ -1,0 +1,186 @@
+// A ray on CUDA: a team of threads (see team.cuh) walks it, all of them with the same state, and remembers its samples for
+// the walk back.
+//
+// The grid is as large as the device holds, and its teams go round over the rays, so that the memory for the samples
+// depends on the device and the longest ray, and what is in use of it stays in the cache. While the records of a sample
+// are on their way, the next sample is found and located.
+#pragma once
+
+#include "sums.cuh"
+#include "team.cuh"
+
+namespace surfcap {
+inline namespace SURFCAP_ISA {
+
+constexpr int64_t kTraceBytes = int64_t(1) << 30;  // memory for samples: where rays are long, fewer of them are in flight
+constexpr int kWords = 8;                          // numbers that a sample is remembered by
+
+// The samples of a ray: (value, r, g, b), then a, T, the opacity's state, and the index k, inverted where a run starts.
+template <class Real, class Opacity> class TeamTrace {
+ public:
+  __device__ TeamTrace(const Team& team, Real* words, const Opacity& opacity, const Lattice<Real>& lattice)
+      : team_(team), words_(words), opacity_(opacity), lattice_(lattice) {}
+
+  __device__ void put(int i, const Sample<Real, Opacity>& sample) const {
+    Pack<Real, 4> half = sample.color;
+    if (team_.lane == 1) {
+      half[0] = sample.a;
+      half[1] = sample.transmittance;
+      __builtin_memcpy(&half[2], &sample.now, sizeof(Real));
+      const int32_t k = sample.starts_run ? ~sample.k : sample.k;
+      half[3] = Real(0);
+      __builtin_memcpy(&half[3], &k, sizeof(k));
+    }
+    if (team_.lane < 2) store_aligned<Real, 4>(words_ + i * kWords + 4 * team_.lane, half);
+  }
+
+  __device__ Sample<Real, Opacity> operator[](int i) const {
+    const Real* const words = words_ + int64_t(i) * kWords;
+    const Pack<Real, 4> rest = load_aligned<Real, 4>(words + 4);
+    Sample<Real, Opacity> sample;
+    sample.color = load_aligned<Real, 4>(words);
+    sample.a = rest[0];
+    sample.transmittance = rest[1];
+    __builtin_memcpy(&sample.now, &rest[2], sizeof(Real));
+    __builtin_memcpy(&sample.k, &rest[3], sizeof(sample.k));
+    sample.starts_run = sample.k < 0;
+    if (sample.starts_run) {
+      sample.k = ~sample.k;
+      sample.before = opacity_.outside();
+    } else {
+      __builtin_memcpy(&sample.before, words - kWords + 6, sizeof(Real));
+    }
+    Pack<Real, 1> t, u[3];
+    lattice_.place(&sample.k, t, u);
+    sample.t = t[0];
+    return sample;
+  }
+
+ private:
+  const Team& team_;
+  Real* words_;
+  const Opacity& opacity_;
+  const Lattice<Real>& lattice_;
+};
+
+// A ray walked forward; then `ray` is its result and `samples[i]` its i-th sample.
+template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
+  using Reader = TeamField<Real, Degree, Stored>;
+
+ public:
+  __device__ TeamWalk(const Reader& reader, const Field<Real, Stored>& field, const RaySettings<Real>& settings,
+                      const Opacity& opacity, const Rays<Real>& rays, int64_t i, Real* words, int64_t capacity)
+      : samples(reader.team, words, opacity, lattice_),
+        reader_(reader),
+        opacity_(opacity),
+        lattice_(lattice_of(field, rays, settings.step, i)),
+        weights_(reader.weights(rays.directions + 3 * i)) {
+    Compositor<Real, Opacity> front(opacity);
+    int32_t k = 0;
+    typename Reader::Corner corner{};
+    bool more = next(k, corner);
+    while (more) {
+      const typename Reader::Fetched found = reader_.fetch(corner);
+      int32_t k_next = 0;
+      more = next(k_next, corner);
+      Sample<Real, Opacity> sample;
+      front.add(reader_.color(found, weights_), k, time_of(k), sample);
+      samples.put(front.ray.samples - 1, sample);
+      more = more && !(front.ray.transmittance < settings.stop) && front.ray.samples < capacity;
+      k = k_next;
+    }
+    ray = front.ray;
+    reader_.team.sync();
+  }
+
+  // The corner that this thread has read of the sample with the index k.
+  __device__ typename Reader::Corner corner_of(int32_t k) const {
+    Pack<Real, 1> t, u[3];
+    lattice_.place(&k, t, u);
+    return reader_.locate(u);
+  }
+
+  // What rays.h asks to walk back with; `sink(i, sample, g)` as walk_back does.
+  template <class Sink> __device__ auto back(const Sink& sink) const {
+    return [this, &sink](Real r_inf, const auto& term) {
+      walk_back<Real>(samples, ray.samples, opacity_, r_inf, term, sink);
+    };
+  }
+  // The sink that adds to the voxels.
+  template <class Sum> __device__ auto to_voxels(Sum* gradient) const {
+    return [this, gradient](int, const auto& sample, const Pack<Real, 4>& g) {
+      reader_.scatter(gradient, corner_of(sample.k), g, weights_);
+    };
+  }
+
+  RayResult<Real> ray;
+  TeamTrace<Real, Opacity> samples;
+
+ private:
+  __device__ bool next(int32_t& k, typename Reader::Corner& corner) {
+    if (lattice_.next(&k, 1) == 0) return false;
+    corner = corner_of(k);
+    return true;
+  }
+  __device__ Real time_of(int32_t k) const {
+    Pack<Real, 1> t, u[3];
+    lattice_.place(&k, t, u);
+    return t[0];
+  }
+
+  const Reader& reader_;
+  const Opacity& opacity_;
+  Lattice<Real> lattice_;
+  typename Reader::Part weights_;
+};
+
+// What every kernel that walks rays is given.
+template <class Real, int Degree, class Opacity, class Stored> struct Walking {
+  Field<Real, Stored> field;
+  Rays<Real> rays;
+  RaySettings<Real> settings;
+  Opacity opacity;
+  Real* words;
+  int64_t capacity;
+
+  // Calls f(walk, reader, i) for every ray that falls to this team.
+  template <class F> __device__ void for_each_ray(const F& f) const {
+    const TeamField<Real, Degree, Stored> reader(field);
+    Real* const mine = words + first_team() * capacity * kWords;
+    for (int64_t i = first_team(); i < rays.count; i += team_stride()) {
+      const TeamWalk<Real, Degree, Opacity, Stored> walk(reader, field, settings, opacity, rays, i, mine, capacity);
+      f(walk, reader, i);
+      reader.team.sync();  // before the memory of the samples is another ray's
+    }
+  }
+};
+
+// Calls f(walking, blocks) with what is known of the field as types and room for the samples; kernel(walking) is what
+// shall run.
+template <class Real, class Stored, class Kernel, class F>
+void with_walking(const Gpu& gpu, const Tensor& like, const Field<Real, Stored>& field, const Rays<Real>& rays,
+                  const RaySettings<Real>& settings, const Kernel& kernel, const F& f) {
+  if (rays.count == 0) return;
+  const int64_t capacity = most_samples(static_cast<const Grid<Real>&>(field), settings.step);
+  const int64_t block_bytes = kTeamsPerBlock * capacity * kWords * int64_t(sizeof(Real));
+  with_opacity(settings, [&]<class Opacity>(const Opacity& opacity) {
+    with_degree(field.pitch, [&](auto degree) {
+      Walking<Real, decltype(degree)::value, Opacity, Stored> walking{field, rays, settings, opacity, nullptr, capacity};
+      const int64_t needed = (rays.count + kTeamsPerBlock - 1) / kTeamsPerBlock;
+      const int64_t room = std::max<int64_t>(1, kTraceBytes / block_bytes);
+      const int64_t blocks = std::min({needed, room, gpu.resident(kernel(walking))});
+      const Tensor words = torch::stable::new_empty(like, {blocks * block_bytes}, ScalarType::Byte);
+      walking.words = static_cast<Real*>(words.mutable_data_ptr());
+      f(walking, blocks);
+    });
+  });
+}
+
+// What sum_block does for numbers that all threads of a team hold alike.
+template <int N> __device__ void sum_teams(double (&x)[N], double* rows) {
+  for (int n = 0; n < N; ++n) x[n] = threadIdx.x % kTeam == 0 ? x[n] : 0.0;
+  sum_block(x, rows + int64_t(blockIdx.x) * N);
+}
+
+}  // namespace SURFCAP_ISA
+}  // namespace surfcap
