@@ -25,7 +25,13 @@ using Shape = std::initializer_list<int64_t>;
 
 // What a tensor holds is looked at here only where that costs next to nothing: on a device it would stop the host until
 // the device has caught up. There the caller (TileGrid.check, gather_rays, ...) vouches for it.
-inline bool on_host(const Tensor& t) { return t.is_cpu(); }
+inline bool on_host(const Tensor& t) {
+#if defined(SURFCAP_CUDA_EMULATION)
+  return false;
+#else
+  return t.is_cpu();
+#endif
+}
 
 constexpr int64_t kAny = -1;  // a size that any number satisfies
 constexpr int64_t kTileSide = 4, kVoxelsPerTile = 64;
@@ -96,11 +102,19 @@ template <class Number> class Input {
   Tensor tensor_;
 };
 
+// A device reads and writes records in vectors: their memory must begin where one can.
+inline void check_aligned(const char* name, const Tensor& t) {
+  constexpr uintptr_t kVector = 16;
+  STD_TORCH_CHECK(on_host(t) || reinterpret_cast<uintptr_t>(t.const_data_ptr()) % kVector == 0, name,
+                  ": expected memory that begins at a multiple of ", kVector, " bytes, got a view into a record");
+}
+
 // A tensor that an op writes into: no copy may stand between.
 template <class Number> Number* output(const char* name, const Tensor& t, Shape shape) {
   check_shape(name, t, shape);
   STD_TORCH_CHECK(t.scalar_type() == TypeOf<Number>::value, name, ": expected ", TypeOf<Number>::name);
   STD_TORCH_CHECK(t.is_contiguous(), name, ": is written in place and must be contiguous");
+  check_aligned(name, t);
   return static_cast<Number*>(t.mutable_data_ptr());
 }
 
@@ -116,6 +130,7 @@ Field<Real, Stored> field_view(const Input<Stored>& voxels, const Input<int32_t>
                   "voxels: expected 4, 16 or 32 numbers per voxel (SH degree 0, 1, 2, padded), got ", pitch);
   STD_TORCH_CHECK(voxels.tensor().size(0) < (int64_t(1) << 31) / kVoxelsPerTile,
                   "voxels: expected fewer than 33554432 tiles, got ", voxels.tensor().size(0));
+  check_aligned("voxels", voxels.tensor());
   Field<Real, Stored> field;
   field.voxels = voxels.data();
   field.table = table.data();
@@ -261,6 +276,7 @@ template <class Real> struct SlotRowsArgument {
     STD_TORCH_CHECK(narrow || slots.scalar_type() == TypeOf<Real>::value, "slots: expected uint8 or ",
                     TypeOf<Real>::name);
     STD_TORCH_CHECK(slots.is_contiguous(), "slots: expected contiguous memory");
+    check_aligned("slots", slots);
     STD_TORCH_CHECK(exponent >= -100 && exponent <= 100, "exponent: expected -100 to 100, got ", exponent);
     if (!on_host(slots)) return;
     STD_TORCH_CHECK(*starts.data() == 0 && end[-1] == slots.size(0) && std::is_sorted(starts.data(), end),

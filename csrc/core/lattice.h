@@ -31,17 +31,14 @@ template <class Real> class Cells {
   SURFCAP_HD Cells(const Grid<Real>& grid, const Line<Real>& ray) : line(ray), table_(grid.table) {
     inverse_ = fill_pack<Real, 4>(Real(1)) / line.direction;
     for (int axis = 0; axis < 2; ++axis) stride_[axis] = grid.n[axis + 1];
-    Real high[4] = {};
-    int32_t last_cell[4] = {}, forward[4] = {};
+    Pack<Real, 4> high = zero_pack<Real, 4>();
+    last_cell_ = forward_ = fill_pack<int32_t, 4>(0);
     for (int axis = 0; axis < 3; ++axis) {
       high[axis] = Real(kTile * (grid.n[axis] - 1));
-      last_cell[axis] = grid.n[axis] - 2;
-      forward[axis] = line.direction[axis] > Real(0);
+      last_cell_[axis] = grid.n[axis] - 2;
+      forward_[axis] = line.direction[axis] > Real(0);
     }
-    last_cell_ = load<int32_t, 4>(last_cell);
-    forward_ = load<int32_t, 4>(forward);
-    const Pack<Real, 4> a = zero_pack<Real, 4>() - line.origin * inverse_,
-                        b = (load<Real, 4>(high) - line.origin) * inverse_;
+    const Pack<Real, 4> a = zero_pack<Real, 4>() - line.origin * inverse_, b = (high - line.origin) * inverse_;
     const Pack<Real, 4> first = smaller_pack<Real, 4>(a, b), last = larger_pack<Real, 4>(a, b);
     near = larger(larger(first[0], first[1]), larger(first[2], Real(0)));
     far = smaller(smaller(last[0], last[1]), last[2]);

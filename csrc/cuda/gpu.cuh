@@ -20,9 +20,8 @@
 
 namespace surfcap {
 
-constexpr int kThreads = 256;        // of a block
-constexpr int kBlocksPerCore = 16;   // multiprocessor: a grid this large leaves none idle
-constexpr int64_t kAlignment = 16;   // bytes: what a thread loads at once
+constexpr int kThreads = 256;       // of a block
+constexpr int kBlocksPerCore = 16;  // multiprocessor: a grid this large leaves none idle
 
 inline void check_cuda(cudaError_t error, const char* what) {
   STD_TORCH_CHECK(error == cudaSuccess, what, ": CUDA reports ", cudaGetErrorString(error));
@@ -30,8 +29,7 @@ inline void check_cuda(cudaError_t error, const char* what) {
 
 class Gpu {
  public:
-  // Makes the first tensor's device current until destruction. All must be on it, and none a view that begins where
-  // vectors cannot be loaded from.
+  // Makes the first tensor's device current until destruction. All must be on it.
   Gpu(const char* names, std::initializer_list<Tensor> tensors) {
     const Tensor& first = *tensors.begin();
     std::string rest = names;
@@ -41,9 +39,6 @@ class Gpu {
       STD_TORCH_CHECK(t->is_cuda() == first.is_cuda() && t->get_device_index() == first.get_device_index(), name,
                       ": expected on the same device as ", leader);
     }
-    for (const Tensor& t : tensors)
-      STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(t.const_data_ptr()) % kAlignment == 0,
-                      "expected tensors that begin at a multiple of ", kAlignment, " bytes (", names, "): clone() a view");
 #if !defined(SURFCAP_CUDA_EMULATION)
     guard_.emplace(first.get_device_index());
     void* stream = nullptr;

@@ -7,20 +7,20 @@
 namespace surfcap {
 namespace {
 
-template <class Walking> __global__ void __launch_bounds__(kThreads, 2) count_ranges(Walking walking, double quiet, int64_t* counts) {
+template <class Walking> __global__ void __launch_bounds__(kThreads, Walking::kResident) count_ranges(const __grid_constant__ Walking walking, double quiet, int64_t* counts) {
   walking.for_each_ray([&](const auto& walk, const auto& reader, int64_t i) {
     using Real = std::decay_t<decltype(walk.ray.opacity)>;
-    const int count = ray_ranges(walk.samples, walk.ray.samples, walking.settings.step, Real(quiet),
+    const int count = ray_ranges(walk, walk.ray.samples, walking.settings.step, Real(quiet),
                                  [](int, Real, Real) {});
     if (reader.team.lane == 0) counts[i] = count;
   });
 }
 
 template <class Walking, class Real>
-__global__ void __launch_bounds__(kThreads, 2) write_ranges(Walking walking, Real quiet, const int64_t* starts, Real* ranges) {
+__global__ void __launch_bounds__(kThreads, Walking::kResident) write_ranges(const __grid_constant__ Walking walking, Real quiet, const int64_t* starts, Real* ranges) {
   walking.for_each_ray([&](const auto& walk, const auto& reader, int64_t i) {
     Real* const to = ranges + 2 * starts[i];
-    ray_ranges(walk.samples, walk.ray.samples, walking.settings.step, quiet, [&](int n, Real begin, Real end) {
+    ray_ranges(walk, walk.ray.samples, walking.settings.step, quiet, [&](int n, Real begin, Real end) {
       if (reader.team.lane != 0) return;
       to[2 * n] = begin;
       to[2 * n + 1] = end;

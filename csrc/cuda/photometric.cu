@@ -10,8 +10,8 @@ namespace surfcap {
 namespace {
 
 template <class Walking, class Real, class Sum>
-__global__ void __launch_bounds__(kThreads, 2)
-    step_rays(Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss, Rendering<Real> out,
+__global__ void __launch_bounds__(kThreads, Walking::kResident)
+    step_rays(const __grid_constant__ Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss, Rendering<Real> out,
               double* rows, Sum* gradient) {
   double losses[3] = {};
   walking.for_each_ray([&](const auto& walk, const auto&, int64_t i) {
@@ -22,8 +22,8 @@ __global__ void __launch_bounds__(kThreads, 2)
 }
 
 template <class Walking, class Real, class Slot>
-__global__ void __launch_bounds__(kThreads, 2)
-    lattice_rays(Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss, Rendering<Real> out,
+__global__ void __launch_bounds__(kThreads, Walking::kResident)
+    lattice_rays(const __grid_constant__ Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss, Rendering<Real> out,
                  double* rows, SlotRows<Real> slot_rows, Slot* slots) {
   double losses[3] = {};
   walking.for_each_ray([&](const auto& walk, const auto& reader, int64_t i) {

@@ -21,20 +21,20 @@ struct Team {
   int lane;
   unsigned mask;  // of its threads within the warp
 
-  __device__ Team() : lane(threadIdx.x % kTeam), mask(0xffu << (threadIdx.x % 32 / kTeam * kTeam)) {}
+  __device__ __forceinline__ Team() : lane(threadIdx.x % kTeam), mask(0xffu << (threadIdx.x % 32 / kTeam * kTeam)) {}
 
   // What another thread of the team holds.
-  template <class T> __device__ T from(T x, int other) const { return __shfl_sync(mask, x, other, kTeam); }
+  template <class T> __device__ __forceinline__ T from(T x, int other) const { return __shfl_sync(mask, x, other, kTeam); }
 
   // Sums over the threads whose numbers differ in the bits of [first, last).
-  template <class Real> __device__ Pack<Real, 4> sum(Pack<Real, 4> x, int first, int last) const {
+  template <class Real> __device__ __forceinline__ Pack<Real, 4> sum(Pack<Real, 4> x, int first, int last) const {
     for (int bit = first; bit < last; bit *= 2)
       for (int i = 0; i < 4; ++i) x[i] += __shfl_xor_sync(mask, x[i], bit, kTeam);
     return x;
   }
 
   // What the threads wrote before is seen by all of them after.
-  __device__ void sync() const { __syncwarp(mask); }
+  __device__ __forceinline__ void sync() const { __syncwarp(mask); }
 };
 
 // The team's number, and how many there are.
@@ -78,7 +78,7 @@ template <class Real, int Degree, class Stored> class TeamField {
     Real weight[kParts];
   };
 
-  __device__ explicit TeamField(const Field<Real, Stored>& field) : field_(field), part_(team.lane % kParts) {
+  __device__ __forceinline__ explicit TeamField(const Field<Real, Stored>& field) : field_(field), part_(team.lane % kParts) {
     const Code<Real, Degree, Stored> code(field);
     for (int p = 0; p < kParts; ++p) {  // a choice, so that `code` stays in registers
       if (p != part_) continue;
@@ -87,59 +87,60 @@ template <class Real, int Degree, class Stored> class TeamField {
           low_[i] = code.low[4 * p + i];
           scale_[i] = code.scale[4 * p + i];
         }
-        for (int solid = 0; solid < 2; ++solid) missing_[solid][i] = code.missing[solid * kPitch + 4 * p + i];
+        outside_[i] = code.missing[4 * p + i];
+        inside_[i] = code.missing[kPitch + 4 * p + i];
       }
     }
   }
 
-  __device__ Corner locate(const Pack<Real, 1> (&u)[3]) const {
+  __device__ __forceinline__ Corner locate(const Pack<Real, 1> (&u)[3]) const {
     const Corners<Real> corners(field_, u);
     Pack<int32_t, 1> entry;
     const int32_t voxel = corners.voxel(field_, team.lane, entry)[0];
     return {voxel, corners.share(team.lane)[0]};
   }
   // The same at a point in the world.
-  __device__ Corner locate(const Real* point) const {
+  __device__ __forceinline__ Corner locate(const Real* point) const {
     Pack<Real, 1> u[3];
     for (int axis = 0; axis < 3; ++axis) u[axis][0] = in_voxels(static_cast<const Grid<Real>&>(field_), axis, point[axis]);
     return locate(u);
   }
 
-  __device__ Fetched fetch(const Corner& corner) const {
+  __device__ __forceinline__ Fetched fetch(const Corner& corner) const {
     Fetched found;
     for (int n = 0; n < kParts; ++n) {
       const Corner c = of(corner, n);
       found.weight[n] = c.weight;
-      found.record[n] = c.voxel >= 0
-                            ? load_aligned<Stored, 4>(field_.voxels + int64_t(c.voxel) * kPitch + 4 * part_)
-                            : missing_[c.voxel == kInside];
+      found.record[n] = c.voxel == kInside ? inside_ : outside_;
+      if (c.voxel >= 0)
+        found.record[n] = load_aligned<Stored, 4>(field_.voxels + int64_t(c.voxel) * kPitch + 4 * part_);
     }
     return found;
   }
 
   // The trilinear read: this thread's part of the record.
-  __device__ Part read(const Fetched& found) const {
+  __device__ __forceinline__ Part read(const Fetched& found) const {
     Part sum = zero_pack<Real, 4>();
     for (int n = 0; n < kParts; ++n) sum += found.weight[n] * convert_pack<Real, 4, Stored>(found.record[n]);
-    sum = team.sum(sum, kParts, kTeam);
+    sum = team.sum<Real>(sum, kParts, kTeam);
     if constexpr (Code<Real, Degree, Stored>::kNarrow) sum = low_ + sum * scale_;
     return sum;
   }
 
   // This thread's part of the basis in a direction, and (opacity, r, g, b) with it, the same in all threads.
-  __device__ Part weights(const Real* direction) const {
+  __device__ __forceinline__ Part weights(const Real* direction) const {
     const Coefficients<Real, Degree> all = basis_weights<Real, Degree>(direction);
     Part mine = all.part[0];
     for (int p = 1; p < kParts; ++p)
       if (p == part_) mine = all.part[p];
     return mine;
   }
-  __device__ Part color(const Fetched& found, const Part& weights) const {
-    return team.sum(fold_part<Real>(read(found) * weights, part_), 1, kParts);
+  __device__ __forceinline__ Part color(const Fetched& found, const Part& weights) const {
+    return team.sum<Real>(fold_part<Real>(read(found) * weights, part_), 1, kParts);
   }
 
   // The adjoint of read: adds `part`, this thread's part of a gradient, to the records of the 8 corners.
-  template <class Sum> __device__ void scatter(Sum* gradient, const Corner& corner, const Part& part) const {
+  template <class Sum> __device__ __forceinline__ void scatter(Sum* gradient, const Corner& corner, const Part& part) const {
     const Part g = Real(kSumScale<Sum>) * part;
     for (int n = 0; n < kParts; ++n) {
       const Corner c = of(corner, n);
@@ -148,19 +149,19 @@ template <class Real, int Degree, class Stored> class TeamField {
   }
   // The same for a gradient by (opacity, r, g, b).
   template <class Sum>
-  __device__ void scatter(Sum* gradient, const Corner& corner, const Part& by_color, const Part& weights) const {
+  __device__ __forceinline__ void scatter(Sum* gradient, const Corner& corner, const Part& by_color, const Part& weights) const {
     scatter(gradient, corner, weights * unfold_part<Real>(by_color, part_));
   }
 
-  __device__ int part() const { return part_; }
+  __device__ __forceinline__ int part() const { return part_; }
   // Whether this thread is the first of those with its part.
-  __device__ bool leads() const { return team.lane < kParts; }
+  __device__ __forceinline__ bool leads() const { return team.lane < kParts; }
 
   Team team;
 
  private:
   // The corner whose record this thread reads in the n-th round.
-  __device__ Corner of(const Corner& own, int n) const {
+  __device__ __forceinline__ Corner of(const Corner& own, int n) const {
     if constexpr (kParts == 1) return own;
     const int c = n * kAtOnce + team.lane / kParts;
     return {team.from(own.voxel, c), team.from(own.weight, c)};
@@ -169,7 +170,7 @@ template <class Real, int Degree, class Stored> class TeamField {
   const Field<Real, Stored>& field_;
   int part_;
   Part low_, scale_;
-  Pack<Stored, 4> missing_[2];  // what a tile that is missing holds: outside, inside
+  Pack<Stored, 4> outside_, inside_;  // what a tile that is missing holds
 };
 
 }  // namespace SURFCAP_ISA

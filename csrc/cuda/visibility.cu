@@ -16,10 +16,10 @@ __device__ __forceinline__ void raise(double* to, double x) {
 }
 
 template <class Walking, class Real>
-__global__ void __launch_bounds__(kThreads, 2) see_voxels(Walking walking, Real* seen) {
+__global__ void __launch_bounds__(kThreads, Walking::kResident) see_voxels(const __grid_constant__ Walking walking, Real* seen) {
   walking.for_each_ray([&](const auto& walk, const auto&, int64_t) {
     for (int n = 0; n < walk.ray.samples; ++n) {
-      const auto sample = walk.samples[n];
+      const auto sample = walk[n];
       const auto corner = walk.corner_of(sample.k);
       if (corner.voxel < 0 || !(corner.weight > Real(0))) continue;
       raise(seen + 2 * int64_t(corner.voxel), sample.transmittance);

@@ -76,7 +76,8 @@ struct Cuda : Gpu {
     const BlockSums<1> sums(*this, losses, count);
     launch("voxel_terms", add_curvature<Real, Stored, Sum>, count, kThreads, field, coordinates, terms.curvature,
            terms.bend, sums.rows(), gradient);
-    sums.total(torch::stable::narrow(losses, 0, kCurvature, 1));
+    Tensor all = losses;
+    sums.total(torch::stable::narrow(all, 0, kCurvature, 1));
   }
 };
 

@@ -15,28 +15,44 @@ inline namespace SURFCAP_ISA {
 constexpr int64_t kTraceBytes = int64_t(1) << 30;  // memory for samples: where rays are long, fewer of them are in flight
 constexpr int kWords = 8;                          // numbers that a sample is remembered by
 
-// The samples of a ray: (value, r, g, b), then a, T, the opacity's state, and the index k, inverted where a run starts.
-template <class Real, class Opacity> class TeamTrace {
- public:
-  __device__ TeamTrace(const Team& team, Real* words, const Opacity& opacity, const Lattice<Real>& lattice)
-      : team_(team), words_(words), opacity_(opacity), lattice_(lattice) {}
+// A ray walked forward; then `ray` is its result and (*this)[i] its i-th sample. Nothing in here points to another part
+// of it: all of it is to live in registers.
+template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
+  using Reader = TeamField<Real, Degree, Stored>;
 
-  __device__ void put(int i, const Sample<Real, Opacity>& sample) const {
-    Pack<Real, 4> half = sample.color;
-    if (team_.lane == 1) {
-      half[0] = sample.a;
-      half[1] = sample.transmittance;
-      __builtin_memcpy(&half[2], &sample.now, sizeof(Real));
-      const int32_t k = sample.starts_run ? ~sample.k : sample.k;
-      half[3] = Real(0);
-      __builtin_memcpy(&half[3], &k, sizeof(k));
+ public:
+  RayResult<Real> ray;
+
+  // `words` has room for `capacity` samples.
+  __device__ __forceinline__ TeamWalk(const Reader& reader, const Field<Real, Stored>& field,
+                                      const RaySettings<Real>& settings, const Opacity& opacity,
+                                      const Rays<Real>& rays, int64_t i, Real* words, int64_t capacity)
+      : reader_(reader),
+        opacity_(opacity),
+        words_(words),
+        lattice_(lattice_of(field, rays, settings.step, i)),
+        weights_(reader.weights(rays.directions + 3 * i)) {
+    Compositor<Real, Opacity> front(opacity);
+    int32_t k = 0;
+    typename Reader::Corner corner{};
+    bool more = next(k, corner);
+    while (more) {
+      const typename Reader::Fetched found = reader_.fetch(corner);
+      int32_t k_next = 0;
+      more = next(k_next, corner);
+      Sample<Real, Opacity> sample;
+      front.add(reader_.color(found, weights_), k, time_of(k), sample);
+      remember(front.ray.samples - 1, sample);
+      more = more && !(front.ray.transmittance < settings.stop) && front.ray.samples < capacity;
+      k = k_next;
     }
-    if (team_.lane < 2) store_aligned<Real, 4>(words_ + i * kWords + 4 * team_.lane, half);
+    ray = front.ray;
+    reader_.team.sync();
   }
 
-  __device__ Sample<Real, Opacity> operator[](int i) const {
+  __device__ __forceinline__ Sample<Real, Opacity> operator[](int i) const {
     const Real* const words = words_ + int64_t(i) * kWords;
-    const Pack<Real, 4> rest = load_aligned<Real, 4>(words + 4);
+    Pack<Real, 4> rest = load_aligned<Real, 4>(words + 4);
     Sample<Real, Opacity> sample;
     sample.color = load_aligned<Real, 4>(words);
     sample.a = rest[0];
@@ -50,92 +66,69 @@ template <class Real, class Opacity> class TeamTrace {
     } else {
       __builtin_memcpy(&sample.before, words - kWords + 6, sizeof(Real));
     }
-    Pack<Real, 1> t, u[3];
-    lattice_.place(&sample.k, t, u);
-    sample.t = t[0];
+    sample.t = time_of(sample.k);
     return sample;
   }
 
- private:
-  const Team& team_;
-  Real* words_;
-  const Opacity& opacity_;
-  const Lattice<Real>& lattice_;
-};
-
-// A ray walked forward; then `ray` is its result and `samples[i]` its i-th sample.
-template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
-  using Reader = TeamField<Real, Degree, Stored>;
-
- public:
-  __device__ TeamWalk(const Reader& reader, const Field<Real, Stored>& field, const RaySettings<Real>& settings,
-                      const Opacity& opacity, const Rays<Real>& rays, int64_t i, Real* words, int64_t capacity)
-      : samples(reader.team, words, opacity, lattice_),
-        reader_(reader),
-        opacity_(opacity),
-        lattice_(lattice_of(field, rays, settings.step, i)),
-        weights_(reader.weights(rays.directions + 3 * i)) {
-    Compositor<Real, Opacity> front(opacity);
-    int32_t k = 0;
-    typename Reader::Corner corner{};
-    bool more = next(k, corner);
-    while (more) {
-      const typename Reader::Fetched found = reader_.fetch(corner);
-      int32_t k_next = 0;
-      more = next(k_next, corner);
-      Sample<Real, Opacity> sample;
-      front.add(reader_.color(found, weights_), k, time_of(k), sample);
-      samples.put(front.ray.samples - 1, sample);
-      more = more && !(front.ray.transmittance < settings.stop) && front.ray.samples < capacity;
-      k = k_next;
-    }
-    ray = front.ray;
-    reader_.team.sync();
-  }
-
   // The corner that this thread has read of the sample with the index k.
-  __device__ typename Reader::Corner corner_of(int32_t k) const {
+  __device__ __forceinline__ typename Reader::Corner corner_of(int32_t k) const {
     Pack<Real, 1> t, u[3];
     lattice_.place(&k, t, u);
     return reader_.locate(u);
   }
 
   // What rays.h asks to walk back with; `sink(i, sample, g)` as walk_back does.
-  template <class Sink> __device__ auto back(const Sink& sink) const {
+  template <class Sink> __device__ __forceinline__ auto back(const Sink& sink) const {
     return [this, &sink](Real r_inf, const auto& term) {
-      walk_back<Real>(samples, ray.samples, opacity_, r_inf, term, sink);
+      walk_back<Real>(*this, ray.samples, opacity_, r_inf, term, sink);
     };
   }
   // The sink that adds to the voxels.
-  template <class Sum> __device__ auto to_voxels(Sum* gradient) const {
+  template <class Sum> __device__ __forceinline__ auto to_voxels(Sum* gradient) const {
     return [this, gradient](int, const auto& sample, const Pack<Real, 4>& g) {
       reader_.scatter(gradient, corner_of(sample.k), g, weights_);
     };
   }
 
-  RayResult<Real> ray;
-  TeamTrace<Real, Opacity> samples;
-
  private:
-  __device__ bool next(int32_t& k, typename Reader::Corner& corner) {
+  __device__ __forceinline__ bool next(int32_t& k, typename Reader::Corner& corner) {
     if (lattice_.next(&k, 1) == 0) return false;
     corner = corner_of(k);
     return true;
   }
-  __device__ Real time_of(int32_t k) const {
+  __device__ __forceinline__ Real time_of(int32_t k) const {
     Pack<Real, 1> t, u[3];
     lattice_.place(&k, t, u);
     return t[0];
   }
 
+  // A sample as (value, r, g, b), then a, T, the opacity's state, and the index k, inverted where a run starts: the
+  // team's first two threads write a half each.
+  __device__ __forceinline__ void remember(int i, const Sample<Real, Opacity>& sample) const {
+    Pack<Real, 4> half = sample.color;
+    if (reader_.team.lane == 1) {
+      half[0] = sample.a;
+      half[1] = sample.transmittance;
+      __builtin_memcpy(&half[2], &sample.now, sizeof(Real));
+      const int32_t k = sample.starts_run ? ~sample.k : sample.k;
+      half[3] = Real(0);
+      __builtin_memcpy(&half[3], &k, sizeof(k));
+    }
+    if (reader_.team.lane < 2) store_aligned<Real, 4>(words_ + i * kWords + 4 * reader_.team.lane, half);
+  }
+
   const Reader& reader_;
   const Opacity& opacity_;
+  Real* words_;
   Lattice<Real> lattice_;
   typename Reader::Part weights_;
 };
 
 // What every kernel that walks rays is given.
 template <class Real, int Degree, class Opacity, class Stored> struct Walking {
+  // Blocks to a multiprocessor that the registers must do for: 128 a thread for float, twice that for double.
+  static constexpr int kResident = sizeof(Real) == 4 ? 2 : 1;
+
   Field<Real, Stored> field;
   Rays<Real> rays;
   RaySettings<Real> settings;
@@ -144,7 +137,7 @@ template <class Real, int Degree, class Opacity, class Stored> struct Walking {
   int64_t capacity;
 
   // Calls f(walk, reader, i) for every ray that falls to this team.
-  template <class F> __device__ void for_each_ray(const F& f) const {
+  template <class F> __device__ __forceinline__ void for_each_ray(const F& f) const {
     const TeamField<Real, Degree, Stored> reader(field);
     Real* const mine = words + first_team() * capacity * kWords;
     for (int64_t i = first_team(); i < rays.count; i += team_stride()) {

@@ -20,6 +20,7 @@ void adam_step(Tensor voxels, Tensor gradient, Tensor first, Tensor second, Tens
     auto* const value = output<typename Types::Stored>("voxels", voxels, shape);
     Number *const m = output<Number>("first", first, shape), *const v = output<Number>("second", second, shape);
     const Input<typename Types::Sum> g("gradient", gradient, shape);
+    check_aligned("gradient", g.tensor());
     const Input<Real> rates("rate", rate, {pitch}), lows("low", low, {pitch}), highs("high", high, {pitch});
     const AdamSettings<Real> adam{Real(beta1),
                                   Real(beta2),

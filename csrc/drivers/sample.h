@@ -25,6 +25,7 @@ Tensor sample_backward(Tensor grad_values, Tensor voxels, Tensor table, std::vec
     const FieldArgument<Real> field(voxels, table, frame);
     const Input<Real> at("points", points, {kAny, 3});
     const Input<Real> by_values("grad_values", grad_values, {points.size(0), field.view.pitch});
+    check_aligned("grad_values", by_values.tensor());
     const Tensor gradient = torch::stable::empty_like(field.voxels.tensor());
     device.sample_backward(field.view, at.data(), by_values.data(), points.size(0), groups, gradient);
     return gradient;

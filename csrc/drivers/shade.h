@@ -26,6 +26,7 @@ Tensor shade_backward(Tensor grad_values, Tensor voxels, Tensor table, std::vect
     const FieldArgument<Real> field(voxels, table, frame);
     const Input<Real> at("points", points, {kAny, 3}), along("directions", directions, {points.size(0), 3});
     const Input<Real> by_values("grad_values", grad_values, {points.size(0), 4});
+    check_aligned("grad_values", by_values.tensor());
     const Tensor gradient = torch::stable::empty_like(field.voxels.tensor());
     device.shade_backward(field.view, at.data(), along.data(), by_values.data(), points.size(0), groups, gradient);
     return gradient;

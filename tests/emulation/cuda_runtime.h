@@ -20,6 +20,7 @@
 #define __host__
 #define __forceinline__ inline
 #define __launch_bounds__(...)
+#define __grid_constant__
 #define __align__(n) __attribute__((aligned(n)))  // alignas would have to stand before __shared__
 #define __shared__ static  // one block at a time, and all its threads in one thread of the system
 
