@@ -54,3 +54,21 @@ def half_of(mesh: trimesh.Trimesh, axis: int) -> trimesh.Trimesh:
     """The faces of a mesh on the side of CENTER on which x, y or z (0, 1, 2) is greater."""
     faces = mesh.faces[mesh.triangles_center[:, axis] > CENTER[axis]]
     return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def tiled(dense: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """Voxels [T, 4, 4, 4] and table of a dense grid of whole tiles, every tile stored, with the outside rim."""
+    x, y, z = (n // 4 for n in dense.shape)
+    voxels = dense.reshape(x, 4, y, 4, z, 4).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 4, 4, 4)
+    table = torch.full((x + 2, y + 2, z + 2), -2, dtype=torch.int32)
+    table[1:-1, 1:-1, 1:-1] = torch.arange(x * y * z).view(x, y, z)
+    return torch.from_numpy(voxels.astype(np.float32)), table
+
+
+def assert_closed(faces: torch.Tensor) -> None:
+    """Every edge has exactly two faces, which go along it in opposite directions."""
+    start, end = faces.cpu()[:, [0, 1, 1, 2, 2, 0]].view(-1, 2).unbind(1)
+    count = int(faces.max()) + 1
+    there, times = (start * count + end).unique(return_counts=True)
+    assert (times == 1).all()
+    assert torch.equal(there, (end * count + start).unique())

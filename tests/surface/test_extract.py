@@ -5,28 +5,40 @@ import pytest
 import torch
 import trimesh
 
-from tests.surface.shapes import CENTER, RADIUS, VOXEL, ball, ball_distance, colors_of, field_of, signed, soft
+from tests.surface.shapes import (
+    CENTER,
+    RADIUS,
+    VOXEL,
+    assert_closed,
+    ball,
+    ball_distance,
+    colors_of,
+    field_of,
+    signed,
+    soft,
+    tiled,
+)
 from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.surface import extract
-from torch_surfcap.surface.extract import drop_pieces, extract_mesh, isosurface, vertex_normals
+from torch_surfcap.surface.extract import (
+    drop_pieces,
+    extract_mesh,
+    isosurface,
+    march_blocks,
+    vertex_normals,
+)
+from torch_surfcap.surface.marching import march_cells
 
-NOTHING = np.zeros((0, 4, 4, 4), dtype=np.float32)
-
-
-def tiled(dense: np.ndarray, outside: float) -> tuple[np.ndarray, np.ndarray]:
-    """Voxels [T, 4, 4, 4] and table of a dense grid of whole tiles, every tile stored, with the outside rim."""
-    x, y, z = (n // 4 for n in dense.shape)
-    voxels = dense.reshape(x, 4, y, 4, z, 4).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 4, 4, 4)
-    table = np.full((x + 2, y + 2, z + 2), -2, dtype=np.int32)
-    table[1:-1, 1:-1, 1:-1] = np.arange(x * y * z).reshape(x, y, z)
-    return voxels.astype(np.float32), table
+NOTHING = torch.zeros(0, 4, 4, 4)
 
 
-def faces_per_edge(faces: np.ndarray) -> set[int]:
-    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    return set(np.unique(sides, axis=0, return_counts=True)[1].tolist())
+@pytest.fixture(params=[march_blocks, march_cells])
+def march(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Marching cubes of either kind."""
+    monkeypatch.setattr(extract, "march_blocks", request.param)
 
 
+@pytest.mark.usefixtures("march")
 @pytest.mark.parametrize("opacity", ["transparency", "distance"])
 def test_ball(opacity: str) -> None:
     origin, _, distance = ball_distance()
@@ -55,44 +67,46 @@ def test_noise_is_watertight_across_blocks(kind: str, block: int, monkeypatch: p
     size = (28, 24, 20)
     # Values of equal size on both sides of the level are ties for the cells on the two sides of a voxel face.
     dense = rng.normal(size=size) if kind == "noise" else rng.choice([-1.0, 1.0, 0.5, -0.5, 0.0], size=size)
-    voxels, table = tiled(dense, 1.0)
+    voxels, table = tiled(dense)
     whole_vertices, whole_faces = isosurface(voxels, table, 1.0, -1.0, 0.0)
     monkeypatch.setattr(extract, "BLOCK", block)
     vertices, faces = isosurface(voxels, table, 1.0, -1.0, 0.0)
     assert len(vertices) == len(whole_vertices)
     assert len(faces) == len(whole_faces)
-    assert faces_per_edge(faces) == {2}
+    assert_closed(faces)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    assert mesh.is_winding_consistent
     assert mesh.volume > 0
     assert mesh.area_faces.min() > 0
     np.testing.assert_allclose(vertices, whole_vertices, atol=1e-4)
 
 
+@pytest.mark.usefixtures("march")
 def test_vertices_lie_where_the_trilinear_field_crosses() -> None:
     # One voxel of -1 in a room of +3: the six crossings are a quarter of the way to its neighbours.
     dense = np.full((4, 4, 4), 3.0)
     dense[1, 2, 1] = -1.0
-    vertices, faces = isosurface(*tiled(dense, 3.0), 3.0, -3.0, 0.0)
+    vertices, faces = isosurface(*tiled(dense), 3.0, -3.0, 0.0)
     middle = np.array([5.0, 6, 5])  # the rim adds four voxels
     expected = np.concatenate([middle + 0.25 * np.eye(3), middle - 0.25 * np.eye(3)])
     assert len(faces) == 8
     np.testing.assert_allclose(sorted(vertices.tolist()), sorted(expected.tolist()), atol=1e-4)
 
 
+@pytest.mark.usefixtures("march")
 def test_missing_inside_beside_missing_outside_is_closed() -> None:
     # No stored tile at all: two inside tiles alone make a box of 8 x 4 x 4 voxels, half a voxel larger each side.
-    table = np.full((5, 4, 4), -2, dtype=np.int32)
+    table = torch.full((5, 4, 4), -2)
     table[1:3, 1, 1] = -1
     table[0, 0, 0] = -9  # a skip distance is outside as well
     vertices, faces = isosurface(NOTHING, table, 1.0, -1.0, 0.0)
-    assert faces_per_edge(faces) == {2}
-    np.testing.assert_allclose(vertices.min(axis=0), 3.5, atol=1e-3)
-    np.testing.assert_allclose(vertices.max(axis=0), [11.5, 7.5, 7.5], atol=1e-3)
+    assert_closed(faces)
+    np.testing.assert_allclose(vertices.amin(0), 3.5, atol=1e-3)
+    np.testing.assert_allclose(vertices.amax(0), [11.5, 7.5, 7.5], atol=1e-3)
 
 
+@pytest.mark.usefixtures("march")
 def test_nothing_crosses() -> None:
-    table = np.full((3, 3, 3), -2, dtype=np.int32)
+    table = torch.full((3, 3, 3), -2)
     vertices, faces = isosurface(NOTHING, table, 1.0, 0.01, 0.81)
     assert vertices.shape == faces.shape == (0, 3)
     origin, _, distance = ball_distance((8, 8, 8))
@@ -100,12 +114,12 @@ def test_nothing_crosses() -> None:
 
 
 def test_impossible_values_are_refused() -> None:
-    table = np.full((3, 3, 3), -2, dtype=np.int32)
+    table = torch.full((3, 3, 3), -2)
     with pytest.raises(ValueError, match=r"threshold 1: expected less than the value outside, 1"):
         isosurface(NOTHING, table, 1.0, 0.01, 1.0)
     table[1, 1, 1] = 0
     with pytest.raises(ValueError, match="64 voxels are not finite"):
-        isosurface(np.full((1, 4, 4, 4), np.nan, dtype=np.float32), table, 1.0, 0.01, 0.81)
+        isosurface(torch.full((1, 4, 4, 4), torch.nan), table, 1.0, 0.01, 0.81)
 
 
 def _pieces() -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,8 @@
-"""Marching cubes over the stored tiles, welded into one mesh, cleaned, smoothed and coloured."""
+"""The mesh of a field: marching cubes over its tiles, cleaned, smoothed and coloured."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,9 +10,11 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 from skimage.measure import marching_cubes
+from torch import Tensor
 
 from torch_surfcap.distance import Array
-from torch_surfcap.ops import INSIDE
+from torch_surfcap.ops import INSIDE, TILE
+from torch_surfcap.surface.marching import march_cells
 
 if TYPE_CHECKING:
     from torch_surfcap.field.field import SurfaceField
@@ -52,9 +55,8 @@ def extract_mesh(
             the surface would have no end.
     """
     level = field.level if threshold is None else float(threshold)
-    values = field.voxels.detach()[..., 0].cpu().float().numpy()
-    table = field.table.cpu().numpy()
-    vertices, faces = isosurface(values, table, field.outside, field.inside, level)
+    found = isosurface(field.transparency.detach(), field.table, field.outside, field.inside, level)
+    vertices, faces = (x.cpu().numpy() for x in found)
     vertices, faces = drop_pieces(vertices, faces, specks, cavities)
     corner = np.asarray(field.frame[:3], dtype=np.float64)
     mesh = trimesh.Trimesh(corner + (vertices + 0.5) * field.voxel_size, faces, process=False)
@@ -68,13 +70,9 @@ def extract_mesh(
 
 
 def isosurface(
-    values: NDArray[np.float32], table: NDArray[np.int32], outside: float, inside: float, level: float
-) -> tuple[Array, Ints]:
-    """Marching cubes over the tiles of a table.
-
-    Dense blocks with an apron of one voxel are cut out where something crosses the level; a vertex that two blocks
-    share lies on one edge of the voxel grid, and that edge is its identity. Also where a missing inside tile meets a
-    missing outside one, the surface is closed.
+    values: Tensor, table: Tensor, outside: float, inside: float, level: float
+) -> tuple[Tensor, Tensor]:
+    """Marching cubes over the tiles of a table, closed also where a missing inside tile meets a missing outside one.
 
     Args:
         values: [T, 4, 4, 4] voxels of the stored tiles.
@@ -83,44 +81,74 @@ def isosurface(
         level: of the surface; smaller values are matter.
 
     Returns:
-        vertices [V, 3] in voxels of the table, whole numbers at voxel centres, and faces [F, 3], outwards.
+        vertices [V, 3] float64 in voxels of the table, whole numbers at voxel centres, and faces [F, 3], outwards; on
+        the device of the values. On the CPU scikit-image finds them, which decides ambiguous cells by their values.
     """
+    march = march_blocks if values.device.type == "cpu" else march_cells
+    return march(*signed_tiles(values, table, outside, inside, level))
+
+
+def signed_tiles(
+    values: Tensor, table: Tensor, outside: float, inside: float, level: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What marching cubes reads, of the arguments of :func:`isosurface`: tiles [S, 4, 4, 4] float32 of values relative to
+    the level, none of them near 0, which of them stands where [X, Y, Z] int64, and the places [X, Y, Z] bool of those
+    with cells that cross the level."""
     if not outside > level:
         raise ValueError(f"threshold {level:g}: expected less than the value outside, {outside:g}")
-    stored = np.concatenate([values, np.full((1, 4, 4, 4), inside), np.full((1, 4, 4, 4), outside)])
-    stored = stored.astype(np.float32) - np.float32(level)
-    if not np.isfinite(stored).all():
-        raise ValueError(f"{np.count_nonzero(~np.isfinite(stored))} voxels are not finite, expected numbers")
-    tiles = np.where(table >= 0, table, np.where(table == INSIDE, len(values), len(values) + 1))
+    missing = torch.tensor([inside, outside], dtype=torch.float32, device=values.device)
+    stored = torch.cat([values.float(), missing.view(2, 1, 1, 1).expand(2, TILE, TILE, TILE)]) - level
+    finite = stored.isfinite()
+    if not finite.all():
+        raise ValueError(f"{int((~finite).sum())} voxels are not finite, expected numbers")
+    tiles = torch.where(table >= 0, table, len(values) + (table != INSIDE).int()).long()
     # A vertex must lie clearly between its edge's ends for the edge to be told from the coordinates, which come as
     # float32; so values keep a distance from the level. The factor on one side breaks ties A C = B D on a voxel
     # face, where the two cells that share the face may decide differently and leave a hole.
-    stored /= NEAREST * np.abs(stored).max()
-    stored = np.where(stored < 0, np.minimum(stored, -1.0), np.maximum(stored, 1.0) * np.float32(1 + 1e-5))
-    crossing = _reach(stored.min(axis=(1, 2, 3))[tiles], np.minimum) < 0
-    crossing &= _reach(stored.max(axis=(1, 2, 3))[tiles], np.maximum) > 0
-    shape = 4 * np.array(tiles.shape, dtype=np.int64)
+    stored /= NEAREST * stored.abs().max()
+    stored = torch.where(stored < 0, stored.clamp(max=-1.0), stored.clamp(min=1.0) * (1 + 1e-5))
+    crossing = _reach(stored.amin((1, 2, 3))[tiles], torch.minimum) < 0
+    crossing &= _reach(stored.amax((1, 2, 3))[tiles], torch.maximum) > 0
+    return stored, tiles, crossing
+
+
+def _reach(tiles: Tensor, fold: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Minimum or maximum over what the cells of each tile read: the tile and its seven upper neighbours."""
+    for axis in range(3):
+        size = tiles.shape[axis]
+        ahead = torch.cat([tiles.narrow(axis, 1, size - 1), tiles.narrow(axis, size - 1, 1)], axis)
+        tiles = fold(tiles, ahead)
+    return tiles
+
+
+def march_blocks(stored: Tensor, tiles: Tensor, crossing: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`march_cells` by scikit-image, with ambiguous cells decided by their values, on the host.
+
+    Dense blocks with an apron of one voxel are cut out where something crosses the level; a vertex that two blocks
+    share lies on one edge of the voxel grid, and that edge is its identity.
+    """
+    vertices, faces = _weld(_blocks(*(x.cpu().numpy() for x in (stored, tiles, crossing))))
+    return torch.from_numpy(vertices), torch.from_numpy(faces)
+
+
+def _blocks(
+    stored: NDArray[np.float32], tiles: Ints, crossing: NDArray[np.bool_]
+) -> list[tuple[Array, Ints, Ints]]:
+    """Vertices, faces and edge numbers of the vertices, block by block."""
+    shape = TILE * np.array(tiles.shape, dtype=np.int64)
     found: list[tuple[Array, Ints, Ints]] = []
     for start in np.unique(np.argwhere(crossing) // BLOCK, axis=0) * BLOCK:
         part = np.argwhere(crossing[tuple(slice(s, s + BLOCK) for s in start)])
         first, last = start + part.min(axis=0), start + part.max(axis=0)
         cut = tiles[tuple(slice(a, b + 2) for a, b in zip(first, last, strict=True))]
-        block = stored[cut].transpose(0, 3, 1, 4, 2, 5).reshape([4 * n for n in cut.shape])
-        block = block[tuple(slice(4 * n + 1) for n in last - first + 1)]
+        block = stored[cut].transpose(0, 3, 1, 4, 2, 5).reshape([TILE * n for n in cut.shape])
+        block = block[tuple(slice(TILE * n + 1) for n in last - first + 1)]
         if block.min() > 0 or block.max() < 0:
             continue  # the neighbours cross the level beyond their first layer only
         # "descent" is meant for left-handed axes: here it turns the faces towards the larger values.
         corners, faces, _, _ = marching_cubes(block, 0.0, gradient_direction="descent")
-        found.append((corners + 4.0 * first, faces, _edge(corners, 4 * first, shape)))
-    return _weld(found)
-
-
-def _reach(tiles: NDArray[np.float32], fold: np.ufunc) -> NDArray[np.float32]:
-    """Minimum or maximum over what the cells of each tile read: the tile and its seven upper neighbours."""
-    for axis in range(3):
-        ahead = np.concatenate([tiles.take(range(1, tiles.shape[axis]), axis), tiles.take([-1], axis)], axis)
-        tiles = fold(tiles, ahead)
-    return tiles
+        found.append((corners + float(TILE) * first, faces, _edge(corners, TILE * first, shape)))
+    return found
 
 
 def _edge(corners: NDArray[np.float32], first: Ints, shape: Ints) -> Ints:
