@@ -15,6 +15,7 @@ from torch import Tensor
 from torch_surfcap.distance import Array
 from torch_surfcap.ops import INSIDE, TILE
 from torch_surfcap.surface.marching import march_cells
+from torch_surfcap.surface.smoothing import taubin
 
 if TYPE_CHECKING:
     from torch_surfcap.field.field import SurfaceField
@@ -42,7 +43,7 @@ def extract_mesh(
     Args:
         field: the field.
         threshold: value of the surface; matter is where the value is smaller. None: the field's own level.
-        smooth: rounds of Taubin smoothing (trimesh's: every other round shrinks, the rounds between swell).
+        smooth: rounds of Taubin smoothing (every other round shrinks, the rounds between swell).
         specks: least area of a piece, as a share of the largest one's; 0 keeps everything.
         cavities: keep large inner sheets.
 
@@ -58,13 +59,13 @@ def extract_mesh(
     found = isosurface(field.transparency.detach(), field.table, field.outside, field.inside, level)
     vertices, faces = (x.cpu().numpy() for x in found)
     vertices, faces = drop_pieces(vertices, faces, specks, cavities)
+    if smooth and len(faces):
+        at, around = (torch.from_numpy(x).to(field.table.device) for x in (vertices, faces))
+        vertices = taubin(at, around, smooth).cpu().numpy()
     corner = np.asarray(field.frame[:3], dtype=np.float64)
     mesh = trimesh.Trimesh(corner + (vertices + 0.5) * field.voxel_size, faces, process=False)
     if len(faces) == 0:
         return mesh
-    if smooth:
-        operator = trimesh.smoothing.laplacian_calculation(mesh).tocsr()
-        trimesh.smoothing.filter_taubin(mesh, iterations=smooth, laplacian_operator=operator)
     mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=vertex_colors(field, mesh))
     return mesh
 
