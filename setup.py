@@ -11,9 +11,16 @@ from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
 # Switches, all from the environment.
-CUDA = os.environ.get("TORCH_SURFCAP_CUDA")  # 0 | 1; unset: if there are nvcc and a torch with CUDA
+# TORCH_SURFCAP_CUDA: 0, or 1; unset: if there are nvcc and a torch with CUDA. For tests: "alone", without the CPU's
+# kernels, and "emulated", CUDA's kernels compiled for the CPU.
+CUDA = os.environ.get("TORCH_SURFCAP_CUDA")
 DEBUG = os.environ.get("DEBUG") == "1"  # unoptimised, with symbols and assertions
-ARCHS = os.environ.get("TORCH_CUDA_ARCH_LIST", "8.0;9.0+PTX").replace(".", "").replace("+PTX", "").split(";")
+ARCHS = (
+    os.environ.get("TORCH_CUDA_ARCH_LIST", "7.5;8.0;8.6;8.9;9.0+PTX")
+    .replace(".", "")
+    .replace(" ", ";")
+    .split(";")
+)
 JOBS = int(os.environ.get("MAX_JOBS", os.cpu_count() or 1))  # files compiled at the same time
 
 CC, CXX = os.environ.get("CC", "cc"), os.environ.get("CXX", "c++")
@@ -23,7 +30,16 @@ GPU_SOURCES = sorted(glob("csrc/cuda/*.cu"))
 HOST = ["-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wno-psabi"]
 ABI = ["-DTORCH_TARGET_VERSION=0x020a000000000000", "-DPy_LIMITED_API=0x030A0000"]  # torch 2.10, Python 3.10
 COMMON = [*(["-O0", "-g"] if DEBUG else ["-O3", "-DNDEBUG"]), *ABI, "-Icsrc"]
-GPU = ["-DUSE_CUDA", "-Xcompiler", ",".join(HOST), *(f"-gencode=arch=compute_{n},code=sm_{n}" for n in ARCHS)]
+EMULATION = ["-DSURFCAP_CUDA_EMULATION", "-Itests/emulation"]
+
+
+def gencode(arch: str) -> str:
+    """nvcc's option for 90 or, with PTX for what comes later, 90+PTX."""
+    n = arch.removesuffix("+PTX")
+    return f"-gencode=arch=compute_{n},code=[sm_{n}{f',compute_{n}' if n != arch else ''}]"
+
+
+GPU = ["-DUSE_CUDA", "--expt-relaxed-constexpr", "-diag-suppress=128", *map(gencode, ARCHS)]
 
 
 class BuildOps(build_ext):
@@ -31,26 +47,34 @@ class BuildOps(build_ext):
         """Compile, several at a time, the sources whose object is older than a file they read; then link."""
         import torch  # not at the top: reading the metadata needs no torch
 
-        cuda = CUDA == "1" or bool(not CUDA and GPU_SOURCES and torch.version.cuda and os.path.exists(NVCC))
-        cpp = ["-std=c++20", *["-DTORCH_SURFCAP_CUDA"] * cuda]
-        tools = {".c": [CC, *HOST], ".cpp": [CXX, *cpp, *HOST], ".cu": [NVCC, *cpp, *GPU]}
+        nvcc = CUDA in ("1", "alone") or (not CUDA and torch.version.cuda and os.path.exists(NVCC))
+        sources = ext.sources + GPU_SOURCES * bool(nvcc or CUDA == "emulated")
+        if CUDA in ("alone", "emulated"):
+            sources = [name for name in sources if not name.startswith("csrc/cpu")]
+        tools = {".c": [CC, *HOST], ".cpp": [CXX, "-std=c++20", *HOST]}
+        tools[".cu"] = [NVCC, "-std=c++20", "-Xcompiler", ",".join(HOST), *GPU]
+        if CUDA == "emulated":
+            sources.append("tests/emulation/emulation.cpp")
+            tools[".cu"] = [*tools[".cpp"], *EMULATION, "-x", "c++"]
         root = Path(torch.__file__).parent
         common = [*COMMON, "-isystem", f"{root}/include", "-isystem", sysconfig.get_path("include")]
-        key = hashlib.sha256(repr((tools, common, torch.__version__)).encode()).hexdigest()[:12]
 
         def compiled(source: str) -> str:
+            tool = tools[Path(source).suffix]
+            key = hashlib.sha256(repr((tool, common, torch.__version__)).encode()).hexdigest()[:12]
             target, listing = (Path("build/objects", key, source + suffix) for suffix in (".o", ".d"))
             os.makedirs(target.parent, exist_ok=True)
             needs = listing.read_text().replace("\\\n", "").split()[1:] if target.exists() else [""]
-            if any(not os.path.exists(n) or os.path.getmtime(n) > target.stat().st_mtime for n in needs):
-                command = [*tools[Path(source).suffix], *common, "-MMD", "-MF", str(listing), "-c", source]
-                self.spawn([*command, "-o", str(target)])
+            if self.force or any(
+                not os.path.exists(n) or os.path.getmtime(n) > target.stat().st_mtime for n in needs
+            ):
+                self.spawn([*tool, *common, "-MMD", "-MF", str(listing), "-c", source, "-o", str(target)])
             return str(target)
 
         with ThreadPoolExecutor(JOBS) as pool:
-            objects = list(pool.map(compiled, ext.sources + GPU_SOURCES * cuda))
-        libraries = ["-ltorch", "-ltorch_cpu", "-lc10", *["-ltorch_cuda"] * bool(cuda and torch.version.cuda)]
-        link = [NVCC if cuda else CXX, "-shared", *objects, f"-L{root}/lib", *libraries]
+            objects = list(pool.map(compiled, sources))
+        libraries = ["-ltorch", "-ltorch_cpu", "-lc10", *["-ltorch_cuda"] * bool(nvcc and torch.version.cuda)]
+        link = [NVCC if nvcc else CXX, "-shared", *objects, f"-L{root}/lib", *libraries]
         self.mkpath(os.path.dirname(self.get_ext_fullpath(ext.name)))
         self.spawn([*link, "-o", self.get_ext_fullpath(ext.name)])
 

@@ -139,6 +139,20 @@ template <class T, int N> SURFCAP_HD Pack<T, N> larger_pack(const Pack<T, N>& a,
 #endif
 }
 
+// One of two packs. On CUDA number by number, never by address: an array that is indexed leaves the registers.
+template <class T, int N> SURFCAP_HD Pack<T, N> choose_pack(bool first, const Pack<T, N>& a, const Pack<T, N>& b) {
+#if defined(SURFCAP_CUDA)
+  Pack<T, N> r;
+  for (int i = 0; i < N; ++i) {
+    const T x = a[i], y = b[i];
+    r[i] = first ? x : y;
+  }
+  return r;
+#else
+  return first ? a : b;
+#endif
+}
+
 // table[index] for every lane.
 template <int N> SURFCAP_HD Pack<int32_t, N> look_up(const int32_t* table, const Pack<int32_t, N>& index) {
 #if defined(__AVX512F__)

@@ -19,11 +19,11 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-template <class Real> SURFCAP_HD void store_slot(Real* slot, const Pack<Real, 4>& g) { store<Real, 4>(slot, g); }
+template <class Real> SURFCAP_HD void store_slot(Real* slot, const Pack<Real, 4>& g) { store_aligned<Real, 4>(slot, g); }
 template <class Real> SURFCAP_HD void store_slot(uint8_t* slot, const Pack<Real, 4>& g) {
   for (int i = 0; i < 4; ++i) slot[i] = nearest_e5m2(float(g[i]));
 }
-template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const Real* slot) { return load<Real, 4>(slot); }
+template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const Real* slot) { return load_aligned<Real, 4>(slot); }
 template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const uint8_t* slot) {
   return convert_pack<Real, 4, float>(decode_e5m2<4>(slot));
 }
@@ -107,33 +107,34 @@ SURFCAP_HD void find_stand(const Grid<Real>& field, const int32_t* coordinate, i
 template <class Real> struct Share {
   int64_t before, after;  // slots
   Real weight_before, weight_after;
-  int32_t voxel;  // in the tile
 };
 
-// Lists the shares in the voxels first..first + kLanes - 1 of the tile; returns their number, 4 kLanes at most.
+// What a voxel reads by it.
+template <class Real, class Slot> SURFCAP_HD Pack<Real, 4> read_share(const Share<Real>& share, const Slot* slots) {
+  return share.weight_before * load_slot<Real>(slots + 4 * share.before) +
+         share.weight_after * load_slot<Real>(slots + 4 * share.after);
+}
+
+// The share of the stand's voxel l in the c-th pixel around it (bit 1 below, bit 0 to the right); false where it has none.
 template <class Real>
-SURFCAP_HD int find_shares(const Stand<Real>& stand, int first, int64_t width, const SlotRows<Real>& rows,
-                           Share<Real>* shares) {
-  int found = 0;
-  for (int l = 0; l < kLanes; ++l) {
-    if (stand.k[l] + 1 < stand.reach[l][0] || stand.k[l] >= stand.reach[l][1]) continue;
-    for (int c = 0; c < 4; ++c) {
-      const int32_t ray = stand.corner[l][(c & 1) + (c >> 1) * width];
-      if (ray < 0) continue;
-      const int64_t start = rows.starts[ray], count = rows.starts[ray + 1] - start;
-      const int64_t at = int64_t(stand.k[l]) - rows.first[ray];
-      const Real weight =
-          (c & 1 ? stand.right[l] : Real(1) - stand.right[l]) * (c >> 1 ? stand.down[l] : Real(1) - stand.down[l]);
-      Share<Real>& share = shares[found];
-      share.before = start + larger<int64_t>(at, 0);
-      share.after = start + smaller<int64_t>(at + 1, count - 1);
-      share.weight_before = at >= 0 ? weight * (Real(1) - stand.after[l]) : Real(0);
-      share.weight_after = at + 1 < count ? weight * stand.after[l] : Real(0);
-      share.voxel = first + l;
-      found += at >= -1 && at < count;  // without a branch: every other one misses
-    }
-  }
-  return found;
+SURFCAP_HD bool find_share(const Stand<Real>& stand, int l, int c, int64_t width, const SlotRows<Real>& rows,
+                           Share<Real>& share) {
+  const int32_t ray = stand.corner[l][(c & 1) + (c >> 1) * width];
+  if (ray < 0) return false;
+  const int64_t start = rows.starts[ray], count = rows.starts[ray + 1] - start;
+  const int64_t at = int64_t(stand.k[l]) - rows.first[ray];
+  const Real weight =
+      (c & 1 ? stand.right[l] : Real(1) - stand.right[l]) * (c >> 1 ? stand.down[l] : Real(1) - stand.down[l]);
+  share.before = start + larger<int64_t>(at, 0);
+  share.after = start + smaller<int64_t>(at + 1, count - 1);
+  share.weight_before = at >= 0 ? weight * (Real(1) - stand.after[l]) : Real(0);
+  share.weight_after = at + 1 < count ? weight * stand.after[l] : Real(0);
+  return at >= -1 && at < count;
+}
+
+// Whether any ray around the stand's voxel l has samples there.
+template <class Real> SURFCAP_HD bool within_reach(const Stand<Real>& stand, int l) {
+  return stand.k[l] + 1 >= stand.reach[l][0] && stand.k[l] < stand.reach[l][1];
 }
 
 // The gradient of the record of the stand's voxel l, which has read `read` from one camera's slots.

@@ -14,6 +14,7 @@ SURFCAP_HD void gather_tile(const Grid<Real>& field, const int32_t* coordinate, 
   using R = Record<Degree>;
   Stand<Real> stands[kTileVoxels / kLanes];
   Share<Real> shares[4 * kTileVoxels + 1];
+  int voxels[4 * kTileVoxels + 1];  // whose they are
   Pack<Real, 4> read[kTileVoxels];
   for (int i = 0; i < kTileVoxels * R::kPitch; ++i) gradient[i] = Real(0);
   for (int64_t v = 0; v < cameras.views; ++v) {
@@ -23,14 +24,19 @@ SURFCAP_HD void gather_tile(const Grid<Real>& field, const int32_t* coordinate, 
     for (int first = 0; first < kTileVoxels; first += kLanes) {
       Stand<Real>& stand = stands[first / kLanes];
       find_stand(field, coordinate, first, cameras, v, stand);
-      const int found = find_shares(stand, first, width, rows, shares + count);
-      for (const int end = count + found; count < end; ++count) __builtin_prefetch(slots + 4 * shares[count].before);
+      const int before = count;
+      for (int l = 0; l < kLanes; ++l) {
+        if (!within_reach(stand, l)) continue;
+        for (int c = 0; c < 4; ++c) {
+          voxels[count] = first + l;
+          count += find_share(stand, l, c, width, rows, shares[count]);  // without a branch: every other one misses
+        }
+      }
+      for (int s = before; s < count; ++s) __builtin_prefetch(slots + 4 * shares[s].before);
     }
     if (count == 0) continue;
     for (int i = 0; i < kTileVoxels; ++i) read[i] = zero_pack<Real, 4>();
-    for (int s = 0; s < count; ++s)
-      read[shares[s].voxel] += shares[s].weight_before * load_slot<Real>(slots + 4 * shares[s].before) +
-                               shares[s].weight_after * load_slot<Real>(slots + 4 * shares[s].after);
+    for (int s = 0; s < count; ++s) read[voxels[s]] += read_share(shares[s], slots);
     for (int i = 0; i < kTileVoxels; ++i) {
       const Coefficients<Real, Degree> found =
           by_record<Real, Degree>(stands[i / kLanes], i % kLanes, rows, read[i]);

@@ -25,7 +25,8 @@ __global__ void lay_out(const int64_t* windows, int64_t views, int64_t* offsets,
 
 // A row of blocks of threads to a camera.
 template <class Real>
-__global__ void __launch_bounds__(kThreads) reach_blocks(SlotCameras<Real> cameras, SlotRows<Real> rows, int64_t per_view, int32_t* reach) {
+__global__ void __launch_bounds__(kThreads)
+    reach_blocks(const __grid_constant__ SlotCameras<Real> cameras, const __grid_constant__ SlotRows<Real> rows, int64_t per_view, int32_t* reach) {
   const int64_t v = blockIdx.x / per_view;
   const int64_t blocks = blocks_along(cameras.windows[4 * v + 2]) * blocks_along(cameras.windows[4 * v + 3]);
   for (int64_t b = blockIdx.x % per_view * kThreads + threadIdx.x; b < blocks; b += per_view * kThreads)
@@ -34,7 +35,8 @@ __global__ void __launch_bounds__(kThreads) reach_blocks(SlotCameras<Real> camer
 
 template <int Degree, class Real, class Slot>
 __global__ void __launch_bounds__(kVoxels)
-    gather_voxels(Grid<Real> field, const int32_t* coordinates, SlotCameras<Real> cameras, SlotRows<Real> rows,
+    gather_voxels(const __grid_constant__ Grid<Real> field, const int32_t* coordinates,
+                  const __grid_constant__ SlotCameras<Real> cameras, const __grid_constant__ SlotRows<Real> rows,
                   const Slot* slots, Real* gradient) {
   using R = Record<Degree>;
   for (int64_t voxel = first_item(); voxel < field.tiles * kTileVoxels; voxel += stride()) {
@@ -46,13 +48,12 @@ __global__ void __launch_bounds__(kVoxels)
       if (width == 0) continue;
       Stand<Real> stand;
       find_stand(field, coordinate, int(voxel % kTileVoxels), cameras, v, stand);
-      Share<Real> shares[5];  // four, and where one that is not counted is written
-      const int count = find_shares(stand, int(voxel % kTileVoxels), width, rows, shares);
-      if (count == 0) continue;
+      if (!within_reach(stand, 0)) continue;
       Pack<Real, 4> read = zero_pack<Real, 4>();
-      for (int s = 0; s < count; ++s)
-        read += shares[s].weight_before * load_slot<Real>(slots + 4 * shares[s].before) +
-                shares[s].weight_after * load_slot<Real>(slots + 4 * shares[s].after);
+      for (int c = 0; c < 4; ++c) {
+        Share<Real> share;
+        if (find_share(stand, 0, c, width, rows, share)) read += read_share(share, slots);
+      }
       const Coefficients<Real, Degree> found = by_record<Real, Degree>(stand, 0, rows, read);
       for (int p = 0; p < R::kParts; ++p) sum.part[p] += found.part[p];
     }
@@ -69,16 +70,16 @@ struct Cuda : Gpu {
     SlotCameras<Real> cameras = given.view;
     const Tensor& windows = given.windows.tensor();
     // A block of pixels has at least a quarter of a window of 2 x 2: more there cannot be, and nobody need count them.
-    const int64_t most = given.rays.tensor().numel() / 4;
-    const Tensor offsets = torch::stable::new_empty(windows, {2, cameras.views});
+    const int64_t most = given.rays.tensor().numel() / 4, views = cameras.views;
+    const Tensor offsets = torch::stable::new_empty(windows, {2, views});
     const Tensor reach = torch::stable::new_empty(windows, {most, 2}, ScalarType::Int);
     int64_t* const begin = offsets.template mutable_data_ptr<int64_t>();
     cameras.offsets = begin;
-    cameras.reach_offsets = begin + cameras.views;
+    cameras.reach_offsets = begin + views;
     cameras.reach = reach.template mutable_data_ptr<int32_t>();
-    launch("gather_gradient", lay_out, 1, 1, cameras.windows, cameras.views, begin, begin + cameras.views);
+    launch("gather_gradient", lay_out, 1, 1, cameras.windows, views, begin, begin + views);
     constexpr int64_t kPerView = 4;
-    launch("gather_gradient", reach_blocks<Real>, cameras.views * kPerView, kThreads, cameras, rows.view, kPerView,
+    launch("gather_gradient", reach_blocks<Real>, views * kPerView, kThreads, cameras, rows.view, kPerView,
            reach.template mutable_data_ptr<int32_t>());
     with_slots<Real>(rows.narrow, slots, [&]<class Slot>(const Slot* typed) {
       with_degree(field.pitch, [&](auto degree) {

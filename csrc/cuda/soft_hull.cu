@@ -29,10 +29,11 @@ struct Cuda : Gpu {
   template <class Real>
   void soft_hull(Silhouettes<Real> silhouettes, int64_t, const Input<Real>& points, Real* value,
                  int32_t* votes) const {
-    const Tensor offsets = torch::stable::new_empty(points.tensor(), {silhouettes.views}, ScalarType::Long);
+    const int64_t views = silhouettes.views;
+    const Tensor offsets = torch::stable::new_empty(points.tensor(), {views}, ScalarType::Long);
     int64_t* const begin = offsets.template mutable_data_ptr<int64_t>();
     silhouettes.offsets = begin;
-    launch("soft_hull", lay_out, 1, 1, silhouettes.sizes, silhouettes.views, begin);
+    launch("soft_hull", lay_out, 1, 1, silhouettes.sizes, views, begin);
     const int64_t count = points.tensor().size(0);
     launch("soft_hull", look_up_hull<Real>, blocks(count), kThreads, silhouettes, points.data(), count, value, votes);
   }

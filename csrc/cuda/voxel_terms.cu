@@ -13,7 +13,7 @@ constexpr int kCurvature = kVoxelTerms - 1;
 
 template <int Degree, class Real, class Stored, class Sum>
 __global__ void __launch_bounds__(kThreads)
-    add_terms(Field<Real, Stored> field, const int32_t* coordinates, VoxelTerms<Real> terms, double* rows,
+    add_terms(const __grid_constant__ Field<Real, Stored> field, const int32_t* coordinates, VoxelTerms<Real> terms, double* rows,
               Sum* gradient) {
   using R = Record<Degree>;
   const Code<Real, Degree, Stored> code(field);
@@ -21,6 +21,7 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t i = first_item(); i < field.tiles * kTileVoxels * R::kParts; i += stride()) {
     const int64_t voxel = i / R::kParts, tile = voxel / kTileVoxels;
     TermSums<Degree, Real> sums;
+#pragma unroll
     for (int p = 0; p < R::kParts; ++p) {  // a choice, so that `code` stays in registers
       if (i % R::kParts != p) continue;
       sums.add(field, code, cell_of(field, coordinates + 3 * tile), terms, tile, int(voxel % kTileVoxels), p, gradient);
@@ -32,7 +33,7 @@ __global__ void __launch_bounds__(kThreads)
 
 template <class Real, class Stored, class Sum>
 __global__ void __launch_bounds__(kThreads)
-    add_curvature(Field<Real, Stored> field, const int32_t* coordinates, Real weight, Real eps, double* rows,
+    add_curvature(const __grid_constant__ Field<Real, Stored> field, const int32_t* coordinates, Real weight, Real eps, double* rows,
                   Sum* gradient) {
   __shared__ Real value[kHaloVoxels], bend[kHaloVoxels];
   const Known<Real, Stored> known(field);

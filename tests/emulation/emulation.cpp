@@ -1,6 +1,6 @@
 // The scheduler of the emulated threads: see cuda_runtime.h.
 #undef _FORTIFY_SOURCE  // its longjmp takes a jump to another stack for an error
-#include <cuda_runtime.h>
+#include "cuda_runtime.h"
 #include <setjmp.h>
 #include <sys/mman.h>
 #include <ucontext.h>

@@ -90,11 +90,11 @@ def test_gradcheck(degree: int, device: str) -> None:
     assert torch.autograd.gradcheck(total, scene.voxels.requires_grad_(), fast_mode=True)
 
 
-def test_wrong_arguments_are_named(device: str) -> None:
+def test_wrong_arguments_are_named(device: str, looked_into: bool) -> None:
     good = arguments("voxel_terms", make_scene(device=device))
     for i, wrong, match in (
         (3, good[3][1:], "coordinates: expected shape"),
-        (3, torch.zeros_like(good[3]), "coordinates: expected every tile inside"),
+        *[(3, torch.zeros_like(good[3]), "coordinates: expected every tile inside")] * looked_into,
         (4, [1.0], "weights: expected"),
         (7, good[7][..., :2], "gradient: expected shape"),
         (7, good[7].transpose(1, 2), "gradient: is written in place and must be contiguous"),
