@@ -14,10 +14,12 @@ import torch  # noqa: F401  (the library needs its symbols)
 
 NAME = "torch_surfcap._C"
 
-if NAME in sys.modules:
-    raise ImportError(f"{NAME} is loaded already, expected this plugin to come first")
-spec = importlib.util.spec_from_loader(NAME, ExtensionFileLoader(NAME, os.environ["SURFCAP_EMULATED"]))
-assert spec is not None
-assert spec.loader is not None
-sys.modules[NAME] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(sys.modules[NAME])
+
+def pytest_configure() -> None:
+    if NAME in sys.modules:
+        raise ImportError(f"{NAME} is loaded already, expected this plugin to come first")
+    spec = importlib.util.spec_from_loader(NAME, ExtensionFileLoader(NAME, os.environ["SURFCAP_EMULATED"]))
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[NAME] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules[NAME])
