@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 LIBRARY := torch_surfcap/_C.abi3.so
 CSRC := $(wildcard csrc/*.* csrc/*/*.*)
-CXX_FILES := $(filter %.c %.cpp %.h %.cu %.cuh,$(CSRC))
+CXX_FILES := $(filter %.c %.cpp %.h %.cu %.cuh,$(CSRC) $(wildcard tests/emulation/*))
 
 define HAS_TORCH
 import importlib.metadata, sys

@@ -84,7 +84,8 @@ template <> struct TypeOf<Half> {
 };
 
 // Tensors with their names, "a, b, c": what a device is made from, to check that all of a call's are on it.
-#define SURFCAP_NAMED(...) #__VA_ARGS__, {__VA_ARGS__}
+#define SURFCAP_NAMED(...) \
+  #__VA_ARGS__, { __VA_ARGS__ }
 
 // A contiguous tensor of the right type, kept alive as long as the pointer is used.
 template <class Number> class Input {

@@ -10,7 +10,7 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-constexpr int kHalo = 2, kHaloSide = kTile + 2 * kHalo;  // a tile with a neighbour's neighbours around it
+constexpr int kHalo = 2, kHaloSide = kTile + 2 * kHalo;         // a tile with a neighbour's neighbours around it
 constexpr int kHaloVoxels = kHaloSide * kHaloSide * kHaloSide;  // [x][y][z], z fastest
 #if defined(SURFCAP_CUDA)
 constexpr int kRun = 1;  // voxels along z that a thread takes at once
@@ -49,8 +49,8 @@ template <class Real, class Stored> struct Known {
     high -= hair;
   }
 
-  // The norm's derivative by the Laplacian at kRun cells from number `first` on, x and y within 1..6; returns the sum of
-  // the norms of those that are the tile's own.
+  // The norm's derivative by the Laplacian at kRun cells from number `first` on, x and y within 1..6; returns the sum
+  // of the norms of those that are the tile's own.
   SURFCAP_HD Real bend(const Real* value, int first, Real eps, Real* bend) const {
     using Run = Pack<Real, kRun>;
     const Real* const at = value + first;

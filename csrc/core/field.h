@@ -50,14 +50,18 @@ template <class Real> struct Corners {
 
   // The voxel's index at corner c, or, where it has no tile, the entry of the table; this one in `entry` in any case.
   SURFCAP_HD Index voxel(const Grid<Real>& grid, int c, Index& entry) const {
-    entry = look_up<kLanes>(grid.table, at<int32_t>(tile[0], c >> 2) + at<int32_t>(tile[1], c >> 1) + at<int32_t>(tile[2], c));
+    entry = look_up<kLanes>(grid.table,
+                            at<int32_t>(tile[0], c >> 2) + at<int32_t>(tile[1], c >> 1) + at<int32_t>(tile[2], c));
     // A stored tile has voxel >= entry, a missing one (entry < 0) voxel <= entry: the greater is what is wanted.
-    const Index index = entry * kTileVoxels + (at<int32_t>(local[0], c >> 2) + at<int32_t>(local[1], c >> 1) + at<int32_t>(local[2], c));
+    const Index index = entry * kTileVoxels +
+                        (at<int32_t>(local[0], c >> 2) + at<int32_t>(local[1], c >> 1) + at<int32_t>(local[2], c));
     return larger_pack<int32_t, kLanes>(entry, index);
   }
 
   // The trilinear weight of corner c.
-  SURFCAP_HD Number share(int c) const { return at<Real>(weight[0], c >> 2) * at<Real>(weight[1], c >> 1) * at<Real>(weight[2], c); }
+  SURFCAP_HD Number share(int c) const {
+    return at<Real>(weight[0], c >> 2) * at<Real>(weight[1], c >> 1) * at<Real>(weight[2], c);
+  }
 
  private:
   template <class T> SURFCAP_HD static Pack<T, kLanes> at(const Pack<T, kLanes> (&pair)[2], int bit) {

@@ -46,7 +46,7 @@ template <class Real, int N> struct alignas(N * sizeof(Real) > 16 ? 16 : N * siz
     for (int i = 0; i < N; ++i) r.lane[i] = a.lane[i] op b;                            \
     return r;                                                                          \
   }                                                                                    \
-  SURFCAP_HD PackStruct& operator op##=(const PackStruct& b) { return *this = *this op b; }
+  SURFCAP_HD PackStruct& operator op## = (const PackStruct& b) { return *this = *this op b; }
   SURFCAP_PACK_OPERATOR(+)
   SURFCAP_PACK_OPERATOR(-)
   SURFCAP_PACK_OPERATOR(*)

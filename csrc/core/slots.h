@@ -19,7 +19,9 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-template <class Real> SURFCAP_HD void store_slot(Real* slot, const Pack<Real, 4>& g) { store_aligned<Real, 4>(slot, g); }
+template <class Real> SURFCAP_HD void store_slot(Real* slot, const Pack<Real, 4>& g) {
+  store_aligned<Real, 4>(slot, g);
+}
 template <class Real> SURFCAP_HD void store_slot(uint8_t* slot, const Pack<Real, 4>& g) {
   for (int i = 0; i < 4; ++i) slot[i] = nearest_e5m2(float(g[i]));
 }
@@ -115,7 +117,8 @@ template <class Real, class Slot> SURFCAP_HD Pack<Real, 4> read_share(const Shar
          share.weight_after * load_slot<Real>(slots + 4 * share.after);
 }
 
-// The share of the stand's voxel l in the c-th pixel around it (bit 1 below, bit 0 to the right); false where it has none.
+// The share of the stand's voxel l in the c-th pixel around it (bit 1 below, bit 0 to the right); false where it has
+// none.
 template <class Real>
 SURFCAP_HD bool find_share(const Stand<Real>& stand, int l, int c, int64_t width, const SlotRows<Real>& rows,
                            Share<Real>& share) {

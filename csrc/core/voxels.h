@@ -13,7 +13,8 @@ inline namespace SURFCAP_ISA {
 //   curvature of the opacity value, see there; left out where its weight is 0
 // A missing neighbour counts with its boundary value for the opacity and not at all for colour: black would bleed in.
 // Losses: tv opacity, tv colour, parsimony, ballooning, curvature, unweighted.
-// Here for part p of the record of voxel v, whose tile stands at `cell` of the table. Memory rule: adds to its own record.
+// Here for part p of the record of voxel v, whose tile stands at `cell` of the table. Memory rule: adds to its own
+// record.
 template <int Degree, class Real> struct TermSums {
   using R = Record<Degree>;
   Pack<Real, R::kPart> squares;  // a pair of two stored voxels is met from both

@@ -20,8 +20,6 @@ struct Cpu : Host {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("adam_step", TORCH_BOX(&adam_step<Cpu>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("adam_step", TORCH_BOX(&adam_step<Cpu>)); }
 
 }  // namespace surfcap

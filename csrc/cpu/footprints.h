@@ -6,8 +6,8 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-// Where kLanes points read the store: for each of the 8 corners a voxel's index, negative where there is no tile, and its
-// trilinear weight.
+// Where kLanes points read the store: for each of the 8 corners a voxel's index, negative where there is no tile, and
+// its trilinear weight.
 template <class Real> struct Footprints {
   int32_t voxel[8][kLanes];
   Real weight[8][kLanes];

@@ -1,5 +1,5 @@
-// The gathered gradient on a CPU: one thread takes a tile, lists what its voxels read from a camera, asks for it, and then
-// reads it.
+// The gathered gradient on a CPU: one thread takes a tile, lists what its voxels read from a camera, asks for it, and
+// then reads it.
 #pragma once
 
 #include "../core/slots.h"
@@ -38,8 +38,7 @@ SURFCAP_HD void gather_tile(const Grid<Real>& field, const int32_t* coordinate, 
     for (int i = 0; i < kTileVoxels; ++i) read[i] = zero_pack<Real, 4>();
     for (int s = 0; s < count; ++s) read[voxels[s]] += read_share(shares[s], slots);
     for (int i = 0; i < kTileVoxels; ++i) {
-      const Coefficients<Real, Degree> found =
-          by_record<Real, Degree>(stands[i / kLanes], i % kLanes, rows, read[i]);
+      const Coefficients<Real, Degree> found = by_record<Real, Degree>(stands[i / kLanes], i % kLanes, rows, read[i]);
       Real* const to = gradient + i * R::kPitch;
       for (int p = 0; p < R::kParts; ++p)
         store<Real, R::kPart>(to + p * R::kPart, load<Real, R::kPart>(to + p * R::kPart) + found.part[p]);

@@ -55,8 +55,6 @@ struct Cpu : Host {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("gather_gradient", TORCH_BOX(&gather_gradient<Cpu>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("gather_gradient", TORCH_BOX(&gather_gradient<Cpu>)); }
 
 }  // namespace surfcap

@@ -10,9 +10,8 @@ struct Cpu : Host {
   using Host::Host;
 
   template <class Real, class Stored>
-  Tensor integration_ranges(const Field<Real, Stored>& field, const Rays<Real>& rays,
-                            const RaySettings<Real>& settings, Real quiet, const Tensor& like,
-                            const Tensor& offsets) const {
+  Tensor integration_ranges(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                            Real quiet, const Tensor& like, const Tensor& offsets) const {
     int64_t* const starts = offsets.template mutable_data_ptr<int64_t>();
     // One walk: every block of rays collects its ranges, which are then laid end to end.
     const int64_t blocks = (rays.count + kChunk - 1) / kChunk;
@@ -32,8 +31,6 @@ struct Cpu : Host {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("integration_ranges", TORCH_BOX(&integration_ranges<Cpu>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("integration_ranges", TORCH_BOX(&integration_ranges<Cpu>)); }
 
 }  // namespace surfcap

@@ -100,8 +100,7 @@ void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& ray
 
 template <class Real>
 void reach_of_view(const SlotCameras<Real>& cameras, const SlotRows<Real>& rows, int64_t view, int32_t* reach) {
-  const int64_t blocks =
-      blocks_along(cameras.windows[4 * view + 2]) * blocks_along(cameras.windows[4 * view + 3]);
+  const int64_t blocks = blocks_along(cameras.windows[4 * view + 2]) * blocks_along(cameras.windows[4 * view + 3]);
   for (int64_t b = 0; b < blocks; ++b) find_reach(cameras, rows, view, b, reach + 2 * b);
 }
 
@@ -172,8 +171,7 @@ void for_points(const Field<Real>& field, int64_t begin, int64_t end, const Poin
       for (int axis = 0; axis < 3; ++axis) x[axis][l] = at[axis];
     }
     Pack<Real, kLanes> u[3];
-    for (int axis = 0; axis < 3; ++axis)
-      u[axis] = in_voxels(field, axis, load<Real, kLanes>(x[axis]));
+    for (int axis = 0; axis < 3; ++axis) u[axis] = in_voxels(field, axis, load<Real, kLanes>(x[axis]));
     Footprints<Real> at;
     locate(field, u, at);
     f(at, count, first);
@@ -270,8 +268,7 @@ Real curvature_tile(const Field<Real, Stored>& field, int64_t cell, int64_t tile
   Real value[kHaloVoxels], bend[kHaloVoxels];
   for (int x = 0; x < kHaloSide; ++x)
     for (int y = 0; y < kHaloSide; ++y)
-      for (int z = 0; z < kHaloSide; ++z)
-        value[(x * kHaloSide + y) * kHaloSide + z] = halo_value(field, cell, x, y, z);
+      for (int z = 0; z < kHaloSide; ++z) value[(x * kHaloSide + y) * kHaloSide + z] = halo_value(field, cell, x, y, z);
   const Known<Real, Stored> known(field);
   Real loss = Real(0);
   for (int x = 1; x < kHaloSide - 1; ++x)

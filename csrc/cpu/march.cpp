@@ -22,8 +22,8 @@ struct Cpu : Host {
                       const Real* grad_color, const Real* grad_transmittance, const Real* grad_depth, int64_t groups,
                       const Tensor& gradient) const {
     grouped_sum<Real>(rays.count, groups, gradient, [&](int64_t begin, int64_t end, Real* buffer, int64_t) {
-      best_kernels<Real>().march_backward(field, rays, settings, grad_color, grad_transmittance, grad_depth, begin,
-                                          end, buffer);
+      best_kernels<Real>().march_backward(field, rays, settings, grad_color, grad_transmittance, grad_depth, begin, end,
+                                          buffer);
     });
   }
 };

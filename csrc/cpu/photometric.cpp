@@ -1,5 +1,5 @@
-// photometric_step and photometric_lattice on the CPU. The losses are sums over a fixed number of groups of rays, so that
-// they do not depend on the threads.
+// photometric_step and photometric_lattice on the CPU. The losses are sums over a fixed number of groups of rays, so
+// that they do not depend on the threads.
 #include "../drivers/photometric.h"
 
 #include "parallel.h"
@@ -40,10 +40,10 @@ struct Cpu : Host {
   }
 
   template <class Real, class Stored>
-  void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& rays,
-                           const RaySettings<Real>& settings, const Observation<Real>& seen,
-                           const PhotometricSettings<Real>& loss, const Rendering<Real>& out, const Tensor& losses,
-                           const SlotRows<Real>& rows, bool narrow, void* slots) const {
+  void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                           const Observation<Real>& seen, const PhotometricSettings<Real>& loss,
+                           const Rendering<Real>& out, const Tensor& losses, const SlotRows<Real>& rows, bool narrow,
+                           void* slots) const {
     // Every ray owns its row, so the rays need neither atomics nor buffers of their own.
     constexpr int64_t kLossGroups = 64;
     GroupedLosses sums(kLossGroups);

@@ -28,8 +28,6 @@ struct Cpu : Host {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("soft_hull", TORCH_BOX(&soft_hull<Cpu>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("soft_hull", TORCH_BOX(&soft_hull<Cpu>)); }
 
 }  // namespace surfcap

@@ -21,8 +21,6 @@ struct Cpu : Host {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("upscale", TORCH_BOX(&upscale<Cpu>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("upscale", TORCH_BOX(&upscale<Cpu>)); }
 
 }  // namespace surfcap

@@ -23,8 +23,6 @@ struct Cpu : Host {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("visibility", TORCH_BOX(&visibility<Cpu>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("visibility", TORCH_BOX(&visibility<Cpu>)); }
 
 }  // namespace surfcap

@@ -28,8 +28,6 @@ struct Cpu : Host {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) {
-  m.impl("voxel_terms", TORCH_BOX(&voxel_terms<Cpu>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, CPU, m) { m.impl("voxel_terms", TORCH_BOX(&voxel_terms<Cpu>)); }
 
 }  // namespace surfcap

@@ -1,5 +1,5 @@
-// Rays on a CPU: one thread walks a ray with kLanes samples set up at a time, and has a bundle of rays in flight, so that
-// the waits for memory overlap. A ray's samples and where they read are remembered for the walk back.
+// Rays on a CPU: one thread walks a ray with kLanes samples set up at a time, and has a bundle of rays in flight, so
+// that the waits for memory overlap. A ray's samples and where they read are remembered for the walk back.
 #pragma once
 
 #include "../core/rays.h"

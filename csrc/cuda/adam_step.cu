@@ -1,8 +1,8 @@
 // adam_step on CUDA: a thread to four numbers of a record. Memory rule: writes in place.
 #include "../drivers/adam_step.h"
 
-#include "gpu.cuh"
 #include "../core/adam.h"
+#include "gpu.cuh"
 
 namespace surfcap {
 namespace {
@@ -46,8 +46,6 @@ struct Cuda : Gpu {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) {
-  m.impl("adam_step", TORCH_BOX(&adam_step<Cuda>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) { m.impl("adam_step", TORCH_BOX(&adam_step<Cuda>)); }
 
 }  // namespace surfcap

@@ -1,10 +1,10 @@
-// gather_gradient on CUDA: a thread to a voxel, which reads from all cameras in their order: no atomics, and the same bits in
-// every run. Memory rule: writes.
+// gather_gradient on CUDA: a thread to a voxel, which reads from all cameras in their order: no atomics, and the same
+// bits in every run. Memory rule: writes.
 #include "../drivers/gather_gradient.h"
 
-#include "gpu.cuh"
 #include "../core/choices.h"
 #include "../core/slots.h"
+#include "gpu.cuh"
 
 namespace surfcap {
 namespace {
@@ -26,7 +26,8 @@ __global__ void lay_out(const int64_t* windows, int64_t views, int64_t* offsets,
 // A row of blocks of threads to a camera.
 template <class Real>
 __global__ void __launch_bounds__(kThreads)
-    reach_blocks(const __grid_constant__ SlotCameras<Real> cameras, const __grid_constant__ SlotRows<Real> rows, int64_t per_view, int32_t* reach) {
+    reach_blocks(const __grid_constant__ SlotCameras<Real> cameras, const __grid_constant__ SlotRows<Real> rows,
+                 int64_t per_view, int32_t* reach) {
   const int64_t v = blockIdx.x / per_view;
   const int64_t blocks = blocks_along(cameras.windows[4 * v + 2]) * blocks_along(cameras.windows[4 * v + 3]);
   for (int64_t b = blockIdx.x % per_view * kThreads + threadIdx.x; b < blocks; b += per_view * kThreads)

@@ -7,17 +7,19 @@
 namespace surfcap {
 namespace {
 
-template <class Walking> __global__ void __launch_bounds__(kThreads, Walking::kResident) count_ranges(const __grid_constant__ Walking walking, double quiet, int64_t* counts) {
+template <class Walking>
+__global__ void __launch_bounds__(kThreads, Walking::kResident)
+    count_ranges(const __grid_constant__ Walking walking, double quiet, int64_t* counts) {
   walking.for_each_ray([&](const auto& walk, const auto& reader, int64_t i) {
     using Real = std::decay_t<decltype(walk.ray.opacity)>;
-    const int count = ray_ranges(walk, walk.ray.samples, walking.settings.step, Real(quiet),
-                                 [](int, Real, Real) {});
+    const int count = ray_ranges(walk, walk.ray.samples, walking.settings.step, Real(quiet), [](int, Real, Real) {});
     if (reader.team.lane == 0) counts[i] = count;
   });
 }
 
 template <class Walking, class Real>
-__global__ void __launch_bounds__(kThreads, Walking::kResident) write_ranges(const __grid_constant__ Walking walking, Real quiet, const int64_t* starts, Real* ranges) {
+__global__ void __launch_bounds__(kThreads, Walking::kResident)
+    write_ranges(const __grid_constant__ Walking walking, Real quiet, const int64_t* starts, Real* ranges) {
   walking.for_each_ray([&](const auto& walk, const auto& reader, int64_t i) {
     Real* const to = ranges + 2 * starts[i];
     ray_ranges(walk, walk.ray.samples, walking.settings.step, quiet, [&](int n, Real begin, Real end) {
@@ -32,9 +34,8 @@ struct Cuda : Gpu {
   using Gpu::Gpu;
 
   template <class Real, class Stored>
-  Tensor integration_ranges(const Field<Real, Stored>& field, const Rays<Real>& rays,
-                            const RaySettings<Real>& settings, Real quiet, const Tensor& like,
-                            const Tensor& offsets) const {
+  Tensor integration_ranges(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                            Real quiet, const Tensor& like, const Tensor& offsets) const {
     int64_t* const starts = offsets.template mutable_data_ptr<int64_t>();
     Tensor ranges = torch::stable::new_empty(like, {0, 2});
     const auto count = [](const auto& walking) { return count_ranges<std::decay_t<decltype(walking)>>; };

@@ -7,15 +7,16 @@ namespace surfcap {
 namespace {
 
 template <class Walking, class Real>
-__global__ void __launch_bounds__(kThreads, Walking::kResident) render_rays(const __grid_constant__ Walking walking, Rendering<Real> out) {
+__global__ void __launch_bounds__(kThreads, Walking::kResident)
+    render_rays(const __grid_constant__ Walking walking, Rendering<Real> out) {
   walking.for_each_ray(
       [&](const auto& walk, const auto&, int64_t i) { write_ray(walk.ray, walking.rays.background, i, out); });
 }
 
 template <class Walking, class Real>
 __global__ void __launch_bounds__(kThreads, Walking::kResident)
-    render_rays_backward(const __grid_constant__ Walking walking, const Real* grad_color, const Real* grad_transmittance,
-                         const Real* grad_depth, Real* gradient) {
+    render_rays_backward(const __grid_constant__ Walking walking, const Real* grad_color,
+                         const Real* grad_transmittance, const Real* grad_depth, Real* gradient) {
   walking.for_each_ray([&](const auto& walk, const auto&, int64_t i) {
     const auto sink = walk.to_voxels(gradient);
     adjoint_ray(walk.ray, walking.rays, i, grad_color, grad_transmittance, grad_depth, walk.back(sink));

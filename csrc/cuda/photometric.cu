@@ -1,18 +1,18 @@
-// photometric_step and photometric_lattice on CUDA: a team of threads to a ray. Memory rule: the step adds atomically to
-// the first partial gradient, whose order of sums is left to chance; the lattice writes each ray's own row.
+// photometric_step and photometric_lattice on CUDA: a team of threads to a ray. Memory rule: the step adds atomically
+// to the first partial gradient, whose order of sums is left to chance; the lattice writes each ray's own row.
 #include "../drivers/photometric.h"
 
+#include "../core/slots.h"
 #include "sums.cuh"
 #include "walk.cuh"
-#include "../core/slots.h"
 
 namespace surfcap {
 namespace {
 
 template <class Walking, class Real, class Sum>
 __global__ void __launch_bounds__(kThreads, Walking::kResident)
-    step_rays(const __grid_constant__ Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss, Rendering<Real> out,
-              double* rows, Sum* gradient) {
+    step_rays(const __grid_constant__ Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss,
+              Rendering<Real> out, double* rows, Sum* gradient) {
   double losses[3] = {};
   walking.for_each_ray([&](const auto& walk, const auto&, int64_t i) {
     const auto sink = walk.to_voxels(gradient);
@@ -23,12 +23,13 @@ __global__ void __launch_bounds__(kThreads, Walking::kResident)
 
 template <class Walking, class Real, class Slot>
 __global__ void __launch_bounds__(kThreads, Walking::kResident)
-    lattice_rays(const __grid_constant__ Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss, Rendering<Real> out,
-                 double* rows, SlotRows<Real> slot_rows, Slot* slots) {
+    lattice_rays(const __grid_constant__ Walking walking, Observation<Real> seen, PhotometricSettings<Real> loss,
+                 Rendering<Real> out, double* rows, SlotRows<Real> slot_rows, Slot* slots) {
   double losses[3] = {};
   walking.for_each_ray([&](const auto& walk, const auto& reader, int64_t i) {
     const SlotRow<Real, Slot> row(slot_rows, slots, i);
-    for (int64_t n = reader.team.lane; n < row.count; n += kTeam) store_slot<Real>(row.row + 4 * n, zero_pack<Real, 4>());
+    for (int64_t n = reader.team.lane; n < row.count; n += kTeam)
+      store_slot<Real>(row.row + 4 * n, zero_pack<Real, 4>());
     reader.team.sync();
     const auto sink = [&](int, const auto& sample, const Pack<Real, 4>& g) {
       if (reader.team.lane == 0) row.put(sample.k, g);
@@ -55,10 +56,10 @@ struct Cuda : Gpu {
   }
 
   template <class Real, class Stored>
-  void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& rays,
-                           const RaySettings<Real>& settings, const Observation<Real>& seen,
-                           const PhotometricSettings<Real>& loss, const Rendering<Real>& out, const Tensor& losses,
-                           const SlotRows<Real>& rows, bool narrow, void* slots) const {
+  void photometric_lattice(const Field<Real, Stored>& field, const Rays<Real>& rays, const RaySettings<Real>& settings,
+                           const Observation<Real>& seen, const PhotometricSettings<Real>& loss,
+                           const Rendering<Real>& out, const Tensor& losses, const SlotRows<Real>& rows, bool narrow,
+                           void* slots) const {
     with_slots<Real>(narrow, slots, [&]<class Slot>(const Slot*) {
       const auto kernel = [](const auto& walking) { return lattice_rays<std::decay_t<decltype(walking)>, Real, Slot>; };
       with_walking(*this, losses, field, rays, settings, kernel, [&](const auto& walking, int64_t blocks) {

@@ -18,7 +18,8 @@ __global__ void __launch_bounds__(kThreads)
 
 template <int Degree, class Real>
 __global__ void __launch_bounds__(kThreads)
-    scatter_points(const __grid_constant__ Field<Real> field, const Real* points, const Real* grad_values, int64_t count, Real* gradient) {
+    scatter_points(const __grid_constant__ Field<Real> field, const Real* points, const Real* grad_values,
+                   int64_t count, Real* gradient) {
   const TeamField<Real, Degree, Real> reader(field);
   for (int64_t i = first_team(); i < count; i += team_stride())
     reader.scatter(gradient, reader.locate(points + 3 * i),

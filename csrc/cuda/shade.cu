@@ -7,8 +7,8 @@ namespace surfcap {
 namespace {
 
 template <int Degree, class Real>
-__global__ void __launch_bounds__(kThreads)
-    shade_points(const __grid_constant__ Field<Real> field, const Real* points, const Real* directions, int64_t count, Real* values) {
+__global__ void __launch_bounds__(kThreads) shade_points(const __grid_constant__ Field<Real> field, const Real* points,
+                                                         const Real* directions, int64_t count, Real* values) {
   const TeamField<Real, Degree, Real> reader(field);
   for (int64_t i = first_team(); i < count; i += team_stride()) {
     const auto found = reader.fetch(reader.locate(points + 3 * i));
@@ -19,8 +19,8 @@ __global__ void __launch_bounds__(kThreads)
 
 template <int Degree, class Real>
 __global__ void __launch_bounds__(kThreads)
-    scatter_colors(const __grid_constant__ Field<Real> field, const Real* points, const Real* directions, const Real* grad_values,
-                   int64_t count, Real* gradient) {
+    scatter_colors(const __grid_constant__ Field<Real> field, const Real* points, const Real* directions,
+                   const Real* grad_values, int64_t count, Real* gradient) {
   const TeamField<Real, Degree, Real> reader(field);
   for (int64_t i = first_team(); i < count; i += team_stride())
     reader.scatter(gradient, reader.locate(points + 3 * i), load_aligned<Real, 4>(grad_values + 4 * i),

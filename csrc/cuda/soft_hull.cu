@@ -1,8 +1,8 @@
 // soft_hull on CUDA: a thread to a point. Memory rule: writes.
 #include "../drivers/soft_hull.h"
 
-#include "team.cuh"
 #include "../core/silhouettes.h"
+#include "team.cuh"
 
 namespace surfcap {
 namespace {
@@ -27,8 +27,7 @@ struct Cuda : Gpu {
   using Gpu::Gpu;
 
   template <class Real>
-  void soft_hull(Silhouettes<Real> silhouettes, int64_t, const Input<Real>& points, Real* value,
-                 int32_t* votes) const {
+  void soft_hull(Silhouettes<Real> silhouettes, int64_t, const Input<Real>& points, Real* value, int32_t* votes) const {
     const int64_t views = silhouettes.views;
     const Tensor offsets = torch::stable::new_empty(points.tensor(), {views}, ScalarType::Long);
     int64_t* const begin = offsets.template mutable_data_ptr<int64_t>();
@@ -41,8 +40,6 @@ struct Cuda : Gpu {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) {
-  m.impl("soft_hull", TORCH_BOX(&soft_hull<Cuda>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) { m.impl("soft_hull", TORCH_BOX(&soft_hull<Cuda>)); }
 
 }  // namespace surfcap

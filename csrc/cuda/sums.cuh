@@ -21,7 +21,8 @@ template <int N> __device__ void sum_block(const double (&x)[N], double* row) {
 }
 
 // total [N] = sum over rows [count, N]; one block.
-template <int N> __global__ void __launch_bounds__(kThreads) sum_rows(const double* rows, int64_t count, double* total) {
+template <int N>
+__global__ void __launch_bounds__(kThreads) sum_rows(const double* rows, int64_t count, double* total) {
   double x[N] = {};
   for (int64_t i = threadIdx.x; i < count; i += kThreads)
     for (int n = 0; n < N; ++n) x[n] += rows[i * N + n];

@@ -1,10 +1,11 @@
 // How CUDA's threads read the field: eight as a team, for a ray or a point.
 //
-// Each thread of a team locates one of the 8 corners. Then the records are read: one of 4, 16 or 32 numbers is a part of 4
-// for each of 1, 4 or 8 threads, so that a team reads 8, 2 or 1 corners at a time, and a warp's four teams whole lines of
-// memory, whatever the degree. Sums over the threads with the same part, and over the parts, are butterflies.
+// Each thread of a team locates one of the 8 corners. Then the records are read: one of 4, 16 or 32 numbers is a part
+// of 4 for each of 1, 4 or 8 threads, so that a team reads 8, 2 or 1 corners at a time, and a warp's four teams whole
+// lines of memory, whatever the degree. Sums over the threads with the same part, and over the parts, are butterflies.
 //
-// The rays of a batch stand in blocks of 8 x 8 pixels, so a block of threads, 32 teams, takes 8 x 4 neighbouring pixels.
+// The rays of a batch stand in blocks of 8 x 8 pixels, so a block of threads, 32 teams, takes 8 x 4 neighbouring
+// pixels.
 #pragma once
 
 #include "../core/choices.h"
@@ -24,7 +25,9 @@ struct Team {
   __device__ __forceinline__ Team() : lane(threadIdx.x % kTeam), mask(0xffu << (threadIdx.x % 32 / kTeam * kTeam)) {}
 
   // What another thread of the team holds.
-  template <class T> __device__ __forceinline__ T from(T x, int other) const { return __shfl_sync(mask, x, other, kTeam); }
+  template <class T> __device__ __forceinline__ T from(T x, int other) const {
+    return __shfl_sync(mask, x, other, kTeam);
+  }
 
   // Sums over the threads whose numbers differ in the bits of [first, last).
   template <class Real> __device__ __forceinline__ Pack<Real, 4> sum(Pack<Real, 4> x, int first, int last) const {
@@ -78,7 +81,8 @@ template <class Real, int Degree, class Stored> class TeamField {
     Real weight[kParts];
   };
 
-  __device__ __forceinline__ explicit TeamField(const Field<Real, Stored>& field) : field_(field), part_(team.lane % kParts) {
+  __device__ __forceinline__ explicit TeamField(const Field<Real, Stored>& field)
+      : field_(field), part_(team.lane % kParts) {
     const Code<Real, Degree, Stored> code(field);
     for (int p = 0; p < kParts; ++p) {  // a choice, so that `code` stays in registers
       if (p != part_) continue;
@@ -102,7 +106,8 @@ template <class Real, int Degree, class Stored> class TeamField {
   // The same at a point in the world.
   __device__ __forceinline__ Corner locate(const Real* point) const {
     Pack<Real, 1> u[3];
-    for (int axis = 0; axis < 3; ++axis) u[axis][0] = in_voxels(static_cast<const Grid<Real>&>(field_), axis, point[axis]);
+    for (int axis = 0; axis < 3; ++axis)
+      u[axis][0] = in_voxels(static_cast<const Grid<Real>&>(field_), axis, point[axis]);
     return locate(u);
   }
 
@@ -140,7 +145,8 @@ template <class Real, int Degree, class Stored> class TeamField {
   }
 
   // The adjoint of read: adds `part`, this thread's part of a gradient, to the records of the 8 corners.
-  template <class Sum> __device__ __forceinline__ void scatter(Sum* gradient, const Corner& corner, const Part& part) const {
+  template <class Sum>
+  __device__ __forceinline__ void scatter(Sum* gradient, const Corner& corner, const Part& part) const {
     const Part g = Real(kSumScale<Sum>) * part;
     for (int n = 0; n < kParts; ++n) {
       const Corner c = of(corner, n);
@@ -149,7 +155,8 @@ template <class Real, int Degree, class Stored> class TeamField {
   }
   // The same for a gradient by (opacity, r, g, b).
   template <class Sum>
-  __device__ __forceinline__ void scatter(Sum* gradient, const Corner& corner, const Part& by_color, const Part& weights) const {
+  __device__ __forceinline__ void scatter(Sum* gradient, const Corner& corner, const Part& by_color,
+                                          const Part& weights) const {
     scatter(gradient, corner, weights * unfold_part<Real>(by_color, part_));
   }
 

@@ -8,7 +8,8 @@ namespace {
 
 template <int Degree, class Real>
 __global__ void __launch_bounds__(kThreads)
-    read_centers(const __grid_constant__ Field<Real> coarse, const __grid_constant__ Field<Real> fine, const int32_t* coordinates, int64_t count, Real* voxels) {
+    read_centers(const __grid_constant__ Field<Real> coarse, const __grid_constant__ Field<Real> fine,
+                 const int32_t* coordinates, int64_t count, Real* voxels) {
   const TeamField<Real, Degree, Real> reader(coarse);
   for (int64_t i = first_team(); i < count; i += team_stride()) {
     Real center[3];
@@ -36,8 +37,6 @@ struct Cuda : Gpu {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) {
-  m.impl("upscale", TORCH_BOX(&upscale<Cuda>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) { m.impl("upscale", TORCH_BOX(&upscale<Cuda>)); }
 
 }  // namespace surfcap

@@ -1,5 +1,5 @@
-// visibility on CUDA: a team of threads to a ray, each thread with its own corner. Memory rule: atomic maxima, so the result
-// does not depend on the order.
+// visibility on CUDA: a team of threads to a ray, each thread with its own corner. Memory rule: atomic maxima, so the
+// result does not depend on the order.
 #include "../drivers/visibility.h"
 
 #include "walk.cuh"
@@ -8,15 +8,14 @@ namespace surfcap {
 namespace {
 
 // Numbers that are not negative have the order of their bits.
-__device__ __forceinline__ void raise(float* to, float x) {
-  atomicMax(reinterpret_cast<int*>(to), __float_as_int(x));
-}
+__device__ __forceinline__ void raise(float* to, float x) { atomicMax(reinterpret_cast<int*>(to), __float_as_int(x)); }
 __device__ __forceinline__ void raise(double* to, double x) {
   atomicMax(reinterpret_cast<unsigned long long*>(to), static_cast<unsigned long long>(__double_as_longlong(x)));
 }
 
 template <class Walking, class Real>
-__global__ void __launch_bounds__(kThreads, Walking::kResident) see_voxels(const __grid_constant__ Walking walking, Real* seen) {
+__global__ void __launch_bounds__(kThreads, Walking::kResident)
+    see_voxels(const __grid_constant__ Walking walking, Real* seen) {
   walking.for_each_ray([&](const auto& walk, const auto&, int64_t) {
     for (int n = 0; n < walk.ray.samples; ++n) {
       const auto sample = walk[n];
@@ -45,8 +44,6 @@ struct Cuda : Gpu {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) {
-  m.impl("visibility", TORCH_BOX(&visibility<Cuda>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) { m.impl("visibility", TORCH_BOX(&visibility<Cuda>)); }
 
 }  // namespace surfcap

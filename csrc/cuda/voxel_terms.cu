@@ -1,10 +1,10 @@
-// voxel_terms on CUDA: a thread to a voxel's part of 4 numbers, then, for the curvature, a block to a tile with its halo in
-// shared memory. Memory rule: adds to each voxel's own record, without atomics.
+// voxel_terms on CUDA: a thread to a voxel's part of 4 numbers, then, for the curvature, a block to a tile with its
+// halo in shared memory. Memory rule: adds to each voxel's own record, without atomics.
 #include "../drivers/voxel_terms.h"
 
-#include "sums.cuh"
 #include "../core/choices.h"
 #include "../core/voxels.h"
+#include "sums.cuh"
 
 namespace surfcap {
 namespace {
@@ -13,8 +13,8 @@ constexpr int kCurvature = kVoxelTerms - 1;
 
 template <int Degree, class Real, class Stored, class Sum>
 __global__ void __launch_bounds__(kThreads)
-    add_terms(const __grid_constant__ Field<Real, Stored> field, const int32_t* coordinates, VoxelTerms<Real> terms, double* rows,
-              Sum* gradient) {
+    add_terms(const __grid_constant__ Field<Real, Stored> field, const int32_t* coordinates, VoxelTerms<Real> terms,
+              double* rows, Sum* gradient) {
   using R = Record<Degree>;
   const Code<Real, Degree, Stored> code(field);
   double losses[kVoxelTerms] = {};
@@ -33,8 +33,8 @@ __global__ void __launch_bounds__(kThreads)
 
 template <class Real, class Stored, class Sum>
 __global__ void __launch_bounds__(kThreads)
-    add_curvature(const __grid_constant__ Field<Real, Stored> field, const int32_t* coordinates, Real weight, Real eps, double* rows,
-                  Sum* gradient) {
+    add_curvature(const __grid_constant__ Field<Real, Stored> field, const int32_t* coordinates, Real weight, Real eps,
+                  double* rows, Sum* gradient) {
   __shared__ Real value[kHaloVoxels], bend[kHaloVoxels];
   const Known<Real, Stored> known(field);
   double loss[1] = {};
@@ -84,8 +84,6 @@ struct Cuda : Gpu {
 
 }  // namespace
 
-STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) {
-  m.impl("voxel_terms", TORCH_BOX(&voxel_terms<Cuda>));
-}
+STABLE_TORCH_LIBRARY_IMPL(torch_surfcap, SURFCAP_GPU, m) { m.impl("voxel_terms", TORCH_BOX(&voxel_terms<Cuda>)); }
 
 }  // namespace surfcap

@@ -1,5 +1,5 @@
-// A ray on CUDA: a team of threads (see team.cuh) walks it, all of them with the same state, and remembers its samples for
-// the walk back.
+// A ray on CUDA: a team of threads (see team.cuh) walks it, all of them with the same state, and remembers its samples
+// for the walk back.
 //
 // The grid is as large as the device holds, and its teams go round over the rays, so that the memory for the samples
 // depends on the device and the longest ray, and what is in use of it stays in the cache. While the records of a sample
@@ -12,8 +12,9 @@
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
-constexpr int64_t kTraceBytes = int64_t(1) << 30;  // memory for samples: where rays are long, fewer of them are in flight
-constexpr int kWords = 8;                          // numbers that a sample is remembered by
+constexpr int64_t kTraceBytes = int64_t(1)
+                                << 30;  // memory for samples: where rays are long, fewer of them are in flight
+constexpr int kWords = 8;               // numbers that a sample is remembered by
 
 // A ray walked forward; then `ray` is its result and (*this)[i] its i-th sample. Nothing in here points to another part
 // of it: all of it is to live in registers.
@@ -25,8 +26,8 @@ template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
 
   // `words` has room for `capacity` samples.
   __device__ __forceinline__ TeamWalk(const Reader& reader, const Field<Real, Stored>& field,
-                                      const RaySettings<Real>& settings, const Opacity& opacity,
-                                      const Rays<Real>& rays, int64_t i, Real* words, int64_t capacity)
+                                      const RaySettings<Real>& settings, const Opacity& opacity, const Rays<Real>& rays,
+                                      int64_t i, Real* words, int64_t capacity)
       : reader_(reader),
         opacity_(opacity),
         words_(words),
@@ -158,7 +159,8 @@ void with_walking(const Gpu& gpu, const Tensor& like, const Field<Real, Stored>&
   const int64_t block_bytes = kTeamsPerBlock * capacity * kWords * int64_t(sizeof(Real));
   with_opacity(settings, [&]<class Opacity>(const Opacity& opacity) {
     with_degree(field.pitch, [&](auto degree) {
-      Walking<Real, decltype(degree)::value, Opacity, Stored> walking{field, rays, settings, opacity, nullptr, capacity};
+      Walking<Real, decltype(degree)::value, Opacity, Stored> walking{field,   rays,    settings,
+                                                                      opacity, nullptr, capacity};
       const int64_t needed = (rays.count + kTeamsPerBlock - 1) / kTeamsPerBlock;
       const int64_t room = std::max<int64_t>(1, kTraceBytes / block_bytes);
       const int64_t blocks = std::min({needed, room, gpu.resident(kernel(walking))});

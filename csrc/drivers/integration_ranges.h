@@ -16,8 +16,7 @@ std::tuple<Tensor, Tensor> integration_ranges(Tensor voxels, Tensor table, std::
     const RaysArgument<Real> rays(origins, directions, shift, origins);  // no background is read
     const RaySettings<Real> settings = ray_settings<Real>(opacity, slope, step, stop);
     const Tensor offsets = torch::stable::new_zeros(origins, {rays.view.count + 1}, ScalarType::Long);
-    const Tensor ranges = device.integration_ranges(field.view, rays.view, settings, Real(quiet), origins,
-                                                    offsets);
+    const Tensor ranges = device.integration_ranges(field.view, rays.view, settings, Real(quiet), origins, offsets);
     return {offsets, ranges};
   });
 }

@@ -24,8 +24,8 @@ template <class Device>
 Tensor march_backward(Tensor grad_color, Tensor grad_transmittance, Tensor grad_depth, Tensor voxels, Tensor table,
                       std::vector<double> frame, Tensor origins, Tensor directions, Tensor shift, Tensor background,
                       int64_t opacity, double slope, double step, double stop, int64_t groups) {
-  const Device device(SURFCAP_NAMED(voxels, grad_color, grad_transmittance, grad_depth, table, origins, directions,
-                                    shift, background));
+  const Device device(
+      SURFCAP_NAMED(voxels, grad_color, grad_transmittance, grad_depth, table, origins, directions, shift, background));
   return by_real(voxels, [&]<class Real>(Real) {
     const FieldArgument<Real> field(voxels, table, frame);
     const RaysArgument<Real> rays(origins, directions, shift, background);

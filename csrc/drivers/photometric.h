@@ -1,7 +1,6 @@
-// photometric_step: value and gradient of the photometric, sample and mask losses in one walk there and back per ray, with
-// the last colours, transmittances and depths for what wants to look at them.
-// photometric_lattice: the same up to the gradients of the samples, which it leaves in the slots of their rays (see
-// core/slots.h).
+// photometric_step: value and gradient of the photometric, sample and mask losses in one walk there and back per ray,
+// with the last colours, transmittances and depths for what wants to look at them. photometric_lattice: the same up to
+// the gradients of the samples, which it leaves in the slots of their rays (see core/slots.h).
 #pragma once
 
 #include "../arguments.h"

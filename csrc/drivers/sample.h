@@ -5,8 +5,7 @@
 
 namespace surfcap {
 
-template <class Device>
-Tensor sample_forward(Tensor voxels, Tensor table, std::vector<double> frame, Tensor points) {
+template <class Device> Tensor sample_forward(Tensor voxels, Tensor table, std::vector<double> frame, Tensor points) {
   const Device device(SURFCAP_NAMED(voxels, table, points));
   return by_real(voxels, [&]<class Real>(Real) {
     const FieldArgument<Real> field(voxels, table, frame);

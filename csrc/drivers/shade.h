@@ -12,8 +12,7 @@ Tensor shade_forward(Tensor voxels, Tensor table, std::vector<double> frame, Ten
     const FieldArgument<Real> field(voxels, table, frame);
     const Input<Real> at("points", points, {kAny, 3}), along("directions", directions, {points.size(0), 3});
     const Tensor values = torch::stable::new_empty(voxels, {points.size(0), 4});
-    device.shade_forward(field.view, at.data(), along.data(), points.size(0),
-                         values.template mutable_data_ptr<Real>());
+    device.shade_forward(field.view, at.data(), along.data(), points.size(0), values.template mutable_data_ptr<Real>());
     return values;
   });
 }

@@ -1,10 +1,10 @@
 // The scheduler of the emulated threads: see cuda_runtime.h.
 #undef _FORTIFY_SOURCE  // its longjmp takes a jump to another stack for an error
-#include "cuda_runtime.h"
 #include <setjmp.h>
 #include <sys/mman.h>
 #include <ucontext.h>
 #include <unistd.h>
+#include "cuda_runtime.h"
 
 #include <algorithm>
 #include <cstdio>

@@ -8,7 +8,6 @@
 #include <csignal>
 #include <cstdio>
 #include <cstdlib>
-#include <cub/cub.cuh>
 #include <string>
 #include <thread>
 #include <vector>
@@ -184,13 +183,6 @@ void check_host() {
   assert(cudaGetLastError() == cudaErrorInvalidConfiguration && cudaGetLastError() == cudaSuccess);
   emulated_launch(lanes_finish, 1, dim3(512, 4), 0);
   assert(cudaGetLastError() == cudaErrorInvalidConfiguration);
-
-  std::vector<int64_t> counts = {3, 1, 4, 1, 5};
-  size_t bytes = 0;
-  assert(cub::DeviceScan::InclusiveSum(nullptr, bytes, counts.data(), counts.data(), 5) == cudaSuccess && bytes > 0);
-  std::vector<char> scratch(bytes);
-  cub::DeviceScan::InclusiveSum(scratch.data(), bytes, counts.data(), counts.data(), 5);
-  assert((counts == std::vector<int64_t>{3, 4, 8, 9, 14}));
 
   assert(__popc(0xf0u) == 4 && __ffs(8) == 4 && __ffs(0) == 0 && __clz(1) == 31 && __clz(0) == 32);
   assert(__uint_as_float(__float_as_uint(1.5f)) == 1.5f && __float_as_int(1.0f) == 0x3f800000);
