@@ -33,5 +33,6 @@ STABLE_TORCH_LIBRARY(torch_surfcap, m) {
       "adam_step(Tensor(a!) voxels, Tensor gradient, Tensor(b!) first, Tensor(c!) second, Tensor rate, Tensor low, "
       "Tensor high, float beta1, float beta2, float epsilon, int t, int seed, bool stochastic) -> ()");
   m.def("soft_hull(Tensor points, Tensor projections, Tensor masks, Tensor sizes) -> (Tensor, Tensor)");
+  m.def("rasterize(Tensor corners, Tensor faces, int height, int width) -> Tensor");
   m.def("upscale(" FIELD ", Tensor fine_coordinates, float[] fine_frame) -> Tensor");
 }

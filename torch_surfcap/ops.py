@@ -405,6 +405,16 @@ def soft_hull(points: Tensor, projections: Tensor, masks: Tensor, sizes: Tensor)
     return cast("tuple[Tensor, Tensor]", _ops.soft_hull(points, projections, masks, sizes))
 
 
+def rasterize(corners: Tensor, faces: Tensor, height: int, width: int) -> Tensor:
+    """The nearest face at each pixel's centre, by a z-buffer: [height, width] int32, -1 where there is none.
+
+    Args:
+        corners: [V, 3] pixel position (pixel (0, 0) is centred at (1/2, 1/2)) and depth. faces: [F, 3] int32; those with a
+            corner that is not in front of the camera are left out.
+    """
+    return cast(Tensor, _ops.rasterize(corners, faces, height, width))
+
+
 def upscale(
     voxels: Tensor, table: Tensor, frame: list[float], fine_coordinates: Tensor, fine_frame: list[float]
 ) -> Tensor:

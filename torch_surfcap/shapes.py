@@ -87,6 +87,11 @@ def _(points, *rest):
     return points.new_empty(points.shape[0]), points.new_empty(points.shape[0], dtype=torch.int32)
 
 
+@fake("torch_surfcap::rasterize")
+def _(corners, faces, height, width):
+    return corners.new_empty(height, width, dtype=torch.int32)
+
+
 @fake("torch_surfcap::upscale")
 def _(voxels, table, frame, fine_coordinates, fine_frame):
     return voxels.new_empty(fine_coordinates.shape[0], *voxels.shape[1:])

@@ -17,18 +17,29 @@ inline namespace SURFCAP_ISA {
 // record.
 template <int Degree, class Real> struct TermSums {
   using R = Record<Degree>;
-  Pack<Real, R::kPart> squares;  // a pair of two stored voxels is met from both
+  using P = Pack<Real, R::kPart>;
+  int p;
+  P tv, is_color, is_view;  // weight of the total variation; 1 for coefficients, 1 for those with l > 0
+  P squares;                // a pair of two stored voxels is met from both
   Real parsimony, ballooning, boundary;
 
-  SURFCAP_HD TermSums()
-      : squares(zero_pack<Real, R::kPart>()), parsimony(Real(0)), ballooning(Real(0)), boundary(Real(0)) {}
-
-  static SURFCAP_HD bool is_color(int i) { return i > 0 && i < R::kCoefficients; }
+  SURFCAP_HD TermSums(const VoxelTerms<Real>& terms, int part)
+      : p(part), squares(zero_pack<Real, R::kPart>()), parsimony(Real(0)), ballooning(Real(0)), boundary(Real(0)) {
+    Real weights[R::kPart], color[R::kPart], view[R::kPart];
+    for (int j = 0; j < R::kPart; ++j) {
+      const int i = p * R::kPart + j;
+      color[j] = i > 0 && i < R::kCoefficients ? Real(1) : Real(0);
+      view[j] = i > 3 && i < R::kCoefficients ? Real(1) : Real(0);
+      weights[j] = i == 0 ? terms.tv_opacity : color[j] * terms.tv_color;
+    }
+    tv = load<Real, R::kPart>(weights);
+    is_color = load<Real, R::kPart>(color);
+    is_view = load<Real, R::kPart>(view);
+  }
 
   template <class Stored, class Sum>
   SURFCAP_HD void add(const Field<Real, Stored>& field, const Code<Real, Degree, Stored>& code, int64_t cell,
-                      const VoxelTerms<Real>& terms, int64_t tile, int v, int p, Sum* gradient) {
-    using P = Pack<Real, R::kPart>;
+                      const VoxelTerms<Real>& terms, int64_t tile, int v, Sum* gradient) {
     const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
     const int32_t inner[3] = {kTile * kTile, kTile, 1};
     const auto read = [&](int64_t voxel) {
@@ -56,16 +67,12 @@ template <int Degree, class Real> struct TermSums {
         squares += d * d;
       }
     }
-    P g;
-    for (int j = 0; j < R::kPart; ++j) {
-      const int i = p * R::kPart + j;
-      // Pairs of stored voxels are met from both sides, so each side takes half.
-      g[j] = Real(2) * (i == 0 ? terms.tv_opacity : is_color(i) ? terms.tv_color : Real(0)) * sum[j];
-      if constexpr (Degree > 0) {
-        const Real counts = i > 3 && i < R::kCoefficients ? Real(1) : Real(0);
+    P g = (Real(2) * tv) * sum;  // pairs of stored voxels are met from both sides, so each side takes half
+    if constexpr (Degree > 0) {
+      for (int j = 0; j < R::kPart; ++j) {
         Real derivative;
-        parsimony += counts * huber(record[j], terms.huber, derivative);
-        g[j] += terms.parsimony * counts * derivative;
+        parsimony += is_view[j] * huber(record[j], terms.huber, derivative);
+        g[j] += terms.parsimony * is_view[j] * derivative;
       }
     }
     if (p == 0) {
@@ -75,11 +82,10 @@ template <int Degree, class Real> struct TermSums {
     add_to<Real, R::kPart>(gradient + voxel * R::kPitch + p * R::kPart, Real(kSumScale<Sum>) * g);
   }
 
-  // Adds the terms of part p to `losses`.
-  SURFCAP_HD void add_to_losses(int p, double* losses) const {
+  // Adds the part's terms to `losses`.
+  SURFCAP_HD void add_to_losses(double* losses) const {
     Real tv_color = Real(0);
-    for (int j = 0; j < R::kPart; ++j)
-      if (is_color(p * R::kPart + j)) tv_color += squares[j];
+    for (int j = 0; j < R::kPart; ++j) tv_color += is_color[j] * squares[j];
     if (p == 0) losses[0] += double(Real(0.5) * squares[0] + boundary);
     losses[1] += double(Real(0.5) * tv_color);
     losses[2] += double(parsimony);

@@ -288,10 +288,11 @@ void voxel_terms(const Field<Real, Stored>& field, const int32_t* coordinates, c
     const Code<Real, D, Stored> code(field);
     for (int64_t t = begin; t < end; ++t) {
       const int64_t cell = cell_of(field, coordinates + 3 * t);
-      TermSums<D, Real> sums[Record<D>::kParts];
-      for (int v = 0; v < kTileVoxels; ++v)
-        for (int p = 0; p < Record<D>::kParts; ++p) sums[p].add(field, code, cell, terms, t, v, p, gradient);
-      for (int p = 0; p < Record<D>::kParts; ++p) sums[p].add_to_losses(p, losses);
+      for (int p = 0; p < Record<D>::kParts; ++p) {
+        TermSums<D, Real> sums(terms, p);
+        for (int v = 0; v < kTileVoxels; ++v) sums.add(field, code, cell, terms, t, v, gradient);
+        sums.add_to_losses(losses);
+      }
       if (terms.curvature != Real(0))
         losses[4] += double(curvature_tile(field, cell, t, terms.curvature, terms.bend, gradient));
     }

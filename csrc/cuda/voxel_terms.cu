@@ -20,12 +20,12 @@ __global__ void __launch_bounds__(kThreads)
   double losses[kVoxelTerms] = {};
   for (int64_t i = first_item(); i < field.tiles * kTileVoxels * R::kParts; i += stride()) {
     const int64_t voxel = i / R::kParts, tile = voxel / kTileVoxels;
-    TermSums<Degree, Real> sums;
 #pragma unroll
     for (int p = 0; p < R::kParts; ++p) {  // a choice, so that `code` stays in registers
       if (i % R::kParts != p) continue;
-      sums.add(field, code, cell_of(field, coordinates + 3 * tile), terms, tile, int(voxel % kTileVoxels), p, gradient);
-      sums.add_to_losses(p, losses);
+      TermSums<Degree, Real> sums(terms, p);
+      sums.add(field, code, cell_of(field, coordinates + 3 * tile), terms, tile, int(voxel % kTileVoxels), gradient);
+      sums.add_to_losses(losses);
     }
   }
   sum_block(losses, rows + int64_t(blockIdx.x) * kVoxelTerms);

@@ -33,6 +33,7 @@ NAMES = (
     "voxel_terms",
     "adam_step",
     "soft_hull",
+    "rasterize",
     "upscale",
 )
 GROUPS = 4
@@ -98,11 +99,22 @@ def arguments(name: str, scene: Scene, stop: float = 0.0) -> list[Any]:
         ]
     if name == "soft_hull":
         return hull_arguments(scene)
+    if name == "rasterize":
+        return triangles(scene)
     if name == "upscale":
         fine = torch.cartesian_prod(*[torch.arange(4, dtype=torch.int32)] * 3)[::2].to(scene.table)
         low = [x + 2.1 * scene.frame[3] for x in scene.frame[:3]]
         return [*scene.field, fine, [*low, 0.6 * scene.frame[3], *scene.frame[4:]]]
     raise KeyError(name)
+
+
+def triangles(scene: Scene) -> list[Any]:
+    """As many faces as there are rays over a picture of 13 x 17 pixels, some beyond it, some behind the camera."""
+    v, count = scene.voxels, len(scene.origins)
+    corners = normal(v, 40, 3) * normal(v, 3).new_tensor([8.0, 6.0, 0.6])
+    corners = corners + normal(v, 3).new_tensor([8.0, 6.0, 1.2])
+    faces = torch.arange(3 * count, device=v.device).view(-1, 3) * 7 % 40
+    return [corners, faces.int(), 13, 17]
 
 
 SIZES = ((9, 6), (5, 8), (1, 3))  # width, height of three cameras' pictures

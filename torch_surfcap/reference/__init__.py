@@ -10,6 +10,7 @@ value, inside value].
 """
 
 from .codes import decoded
+from .raster import rasterize
 from .rays import (
     BASIS_OF_PITCH,
     DISTANCE,
@@ -60,6 +61,7 @@ __all__ = [
     "nonempty_cells",
     "photometric_lattice",
     "photometric_step",
+    "rasterize",
     "sample_backward",
     "sample_forward",
     "shade_backward",
