@@ -22,10 +22,12 @@ def steps(dtype: torch.dtype) -> int:
     return int(torch.iinfo(dtype).max) - 1
 
 
-def bounds(pitch: int, outside: float, inside: float) -> tuple[Tensor, Tensor]:
+def bounds(
+    pitch: int, outside: float, inside: float, *, device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor]:
     """(low [P], high [P]) of a padded record's coefficients, float32; the padding has only zero."""
     count = ops.coefficients(ops.degree_of(pitch))
-    low, high = torch.zeros(pitch), torch.zeros(pitch)
+    low, high = (torch.zeros(pitch, device=device) for _ in range(2))
     low[0], high[0] = inside, outside
     high[1:count] = 1.0
     low[4:count] = -1.0
@@ -40,7 +42,7 @@ def encode(voxels: Tensor, outside: float, inside: float, bits: int) -> Tensor:
     """
     if bits == 32:
         return voxels
-    low, high = bounds(voxels.shape[-1], outside, inside)
+    low, high = bounds(voxels.shape[-1], outside, inside, device=voxels.device)
     top = steps(TYPES[bits])
     per_unit = torch.where(high != low, top / (high - low), 0.0)
     return ((voxels - low) * per_unit).round().clamp(0, top).to(TYPES[bits])
@@ -54,5 +56,5 @@ def decode(voxels: Tensor, outside: float, inside: float) -> Tensor:
     """
     if voxels.is_floating_point():
         return voxels
-    low, high = bounds(voxels.shape[-1], outside, inside)
+    low, high = bounds(voxels.shape[-1], outside, inside, device=voxels.device)
     return low + voxels.float() * ((high - low) / steps(voxels.dtype))

@@ -16,8 +16,8 @@ from torch_surfcap.field.field import DIAGONAL, MISSING
 from torch_surfcap.field.tiles import voxel_centers
 from torch_surfcap.fitting.descent import RAY_ARGUMENTS, descend
 from torch_surfcap.fitting.gathered import GatheredGradient, camera_windows, slot_rows
+from torch_surfcap.fitting.late import Stopwatch
 from torch_surfcap.fitting.settings import FitSettings
-from torch_surfcap.fitting.stage import Stopwatch
 
 OPACITIES = ("transparency", "distance")
 
@@ -73,8 +73,8 @@ def test_angle_to_the_exact_gradient(opacity: str, least: float) -> None:
     exact_losses, exact, *_ = ops.photometric_step(**arguments, ranges=gathered.rays.ranges)
     torch.testing.assert_close(losses, exact_losses)
     cosines = gathered.cosines(arguments)
-    assert cosines["cosine_opacity"] > least
-    assert cosines["cosine_color"] > 0.97
+    assert cosines[0] > least
+    assert cosines[1] > 0.97
     sums = [g[..., :4].double().sum((0, 1, 2, 3)) for g in (gradient, exact)]
     torch.testing.assert_close(*sums, rtol=0.01, atol=0)
     for part, within in ((slice(0, 1), 0.1), (slice(1, None), 0.05)):

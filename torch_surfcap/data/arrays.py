@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from torch_surfcap.data.cameras import Cameras, calibration_fault
-from torch_surfcap.data.images import as_float
 from torch_surfcap.errors import InputError
 
 
 def float_tensor(image: Tensor) -> Tensor:
     """A uint8 or float32 picture as float32 in [0, 1]."""
-    return torch.from_numpy(as_float(image.numpy()))
+    return image / 255 if image.dtype == torch.uint8 else image.float()
 
 
 def size_text(picture: Tensor) -> str:

@@ -86,12 +86,13 @@ class Cameras:
         R, t = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3:]
         return -(R.transpose(1, 2) @ t)[:, :, 0]
 
-    def pinhole(self, i: int) -> PinholeCamera:
-        """Camera i as kornia's PinholeCamera (batch of one)."""
+    def pinhole(self, i: int, device: torch.device | str = "cpu") -> PinholeCamera:
+        """Camera i as kornia's PinholeCamera (batch of one), for points on a device."""
         intrinsics = torch.eye(4, dtype=torch.float64)
         intrinsics[:3, :3] = self.K[i]
         width, height = self.size[i, 0:1], self.size[i, 1:2]
-        return PinholeCamera(intrinsics[None], self.world_to_camera[i : i + 1], height, width)
+        camera = (intrinsics[None], self.world_to_camera[i : i + 1], height, width)
+        return PinholeCamera(*(part.to(device) for part in camera))
 
     def projection_matrices(self) -> Tensor:
         """[N,3,4] K [R|t]: world points to homogeneous pixels, the third component being the depth."""
@@ -120,10 +121,11 @@ class Cameras:
         """Origins [M,3] and unit directions [M,3] of the rays through `pixels` [M,2] of camera i.
 
         `pixels` are (u, v) positions, (0.5, 0.5) being the first pixel's centre; all pixels in row-major order by default.
+        The rays are made on the pixels' device.
         """
         uv = self.pixels(i) if pixels is None else pixels.to(torch.float64).reshape(-1, 2)
-        points = self.pinhole(i).unproject(uv[None], torch.ones(1, len(uv), 1, dtype=torch.float64))[0]
-        origins = self.centers[i].expand(len(uv), 3)
+        points = self.pinhole(i, uv.device).unproject(uv[None], uv.new_ones(1, len(uv), 1))[0]
+        origins = self.centers[i].to(uv.device).expand(len(uv), 3)
         return origins, torch.nn.functional.normalize(points - origins, dim=-1)
 
     def subset(self, indices: Sequence[int] | Tensor) -> Cameras:

@@ -124,6 +124,20 @@ class Capture:
             cameras=self.cameras.subset(chosen),
         )
 
+    def on(self, device: torch.device | str) -> Capture:
+        """The same views with images, masks and plates on a device; held-out views stay where they are."""
+        pictures = (
+            None if part is None else [picture.to(device) for picture in part]
+            for part in (self.images, self.masks, self.plates)
+        )
+        images, masks, plates = pictures
+        return self._with(images or [], masks, plates, self.names, self.cameras)
+
+    @property
+    def nbytes(self) -> int:
+        """Of images, masks and plates."""
+        return sum(p.nbytes for part in (self.images, self.masks, self.plates) for p in part or ())
+
     def halved(self) -> Capture:
         """2x2 means of images, masks and plates, with K/2; an odd last row or column is dropped.
 

@@ -41,7 +41,7 @@ class Floor:
 
     def height(self, points: Tensor) -> Tensor:
         """Of points [..., 3] above the floor, [...] float64."""
-        return points.double() @ self.normal - self.offset
+        return points.double() @ self.normal.to(points.device) - self.offset
 
 
 def find_floor(capture: Capture, box: tuple[Tensor, Tensor]) -> Floor | None:

@@ -95,7 +95,9 @@ class SurfaceField(nn.Module):
         self.origin: Tensor
         self.register_buffer("table", grid.table.to(voxels.device), persistent=False)
         self.register_buffer("tile_coords", grid.coords.to(voxels.device), persistent=False)
-        self.register_buffer("origin", torch.tensor(grid.origin, dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "origin", torch.tensor(grid.origin, dtype=torch.float64, device=voxels.device), persistent=False
+        )
         self._corner = grid.origin  # the buffer takes the module's precision, this one stays exact
         self._frame = grid.frame(self.outside, self.inside)
 

@@ -64,21 +64,23 @@ class Silhouettes:
         """
         value, votes = self._ask(points)
         occupied = (value > 0.5) & (votes >= self.quorum)
-        pieces, count = label(occupied.numpy(), np.ones((3, 3, 3)))
-        seen = torch.zeros(count + 1, dtype=votes.dtype)
-        seen.scatter_reduce_(0, torch.from_numpy(pieces).long().flatten(), votes.flatten(), "amax")
+        numbers, count = label(occupied.cpu().numpy(), np.ones((3, 3, 3)))
+        pieces = torch.from_numpy(numbers).to(votes.device).long()
+        seen = votes.new_zeros(count + 1)
+        seen.scatter_reduce_(0, pieces.flatten(), votes.flatten(), "amax")
         seen[0] = 0  # what is not occupied
-        return occupied & (2 * seen >= votes.max())[torch.from_numpy(pieces).long()]
+        return occupied & (2 * seen >= votes.max())[pieces]
 
     def _ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Least mask and number of the cameras that see world points [..., 3], both [...]."""
+        """Least mask and number of the cameras that see world points [..., 3], both [...], on the points' device."""
         flat = points.reshape(-1, 3)
         # Shifting the world to the points' middle keeps single precision exact to far below a pixel.
-        center = flat.double().mean(0) if len(flat) else torch.zeros(3, dtype=torch.float64)
-        shifted = self.projections.clone()
-        shifted[:, :, 3] += self.projections[:, :, :3] @ center
+        center = flat.double().mean(0) if len(flat) else flat.new_zeros(3, dtype=torch.float64)
+        shifted = self.projections.to(flat.device, copy=True)
+        shifted[:, :, 3] += shifted[:, :, :3] @ center
+        masks, sizes = self.masks.to(flat.device), self.sizes.to(flat.device)
         answers = [
-            ops.soft_hull((chunk.double() - center).float(), shifted.float(), self.masks, self.sizes)
+            ops.soft_hull((chunk.double() - center).float(), shifted.float(), masks, sizes)
             for chunk in flat.split(CHUNK)
         ]
         value, votes = (torch.cat(column).reshape(points.shape[:-1]) for column in zip(*answers, strict=True))
@@ -88,6 +90,11 @@ class Silhouettes:
 def grown(mask: Tensor, pixels: int) -> Tensor:
     """Maximum of a mask [H, W] over squares that reach ``pixels`` far."""
     if pixels <= 0:
+        return mask
+    if mask.device.type != "cpu":
+        for reach in ((pixels, 0), (0, pixels)):
+            window = (2 * reach[0] + 1, 2 * reach[1] + 1)
+            mask = torch.nn.functional.max_pool2d(mask[None], window, 1, reach)[0]
         return mask
     square = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
     return torch.from_numpy(cv2.dilate(mask.numpy(), square))

@@ -91,9 +91,9 @@ class TileGrid:
 
     def without(self, tiles: Tensor) -> Tensor:
         """The table with some stored tiles, [T] bool, as outside: what a march that shall not see them reads."""
-        x, y, z = self.places[tiles].long().unbind(1)
+        x, y, z = self.places.long().unbind(1)
         table = self.table.clone()
-        table[x, y, z] = OUTSIDE
+        table[x, y, z] = torch.where(tiles, OUTSIDE, table[x, y, z])
         return with_skips(table)
 
     def borders(self, within: Tensor) -> Tensor:
@@ -158,18 +158,47 @@ def with_skips(table: Tensor) -> Tensor:
     cell that is not empty, so that the march can leave empty space in long strides. Values mean the same."""
     if table.dim() != 3:
         raise ValueError(f"table: expected int32 [X+2, Y+2, Z+2], got {table.dtype} {list(table.shape)}")
-    occupied = (table > OUTSIDE).cpu().numpy()
-    cell = occupied.copy()  # a cell is empty if the tiles t .. t + 1 are outside
+    cell = table > OUTSIDE  # a cell is empty if the tiles t .. t + 1 are outside
     for axis in range(3):
-        upper = np.zeros_like(cell)
-        low, high = [slice(None)] * 3, [slice(None)] * 3
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        upper[tuple(low)] = cell[tuple(high)]
-        cell |= upper
-    skips = np.full(cell.shape, MAX_SKIP, dtype=np.int32)
+        upper = cell.narrow(axis, 1, cell.shape[axis] - 1).clone()
+        cell.narrow(axis, 0, cell.shape[axis] - 1).logical_or_(upper)
+    skips = _skips_on_host(cell) if table.device.type == "cpu" else skips_by_doubling(cell)
+    return torch.where(table > OUTSIDE, table, OUTSIDE - skips.int())
+
+
+def _skips_on_host(cell: Tensor) -> Tensor:
+    """What :func:`skips_by_doubling` gives, by scipy: on the CPU that takes a tenth of the time."""
+    distance = np.full(cell.shape, MAX_SKIP, dtype=np.int32)
     if cell.any():
-        skips = np.minimum(distance_transform_cdt(~cell, metric="chessboard"), MAX_SKIP).astype(np.int32)
-    return torch.where(table > OUTSIDE, table, OUTSIDE - torch.from_numpy(skips).to(table.device))
+        distance = np.minimum(distance_transform_cdt(~cell.numpy(), metric="chessboard"), MAX_SKIP)
+    return torch.from_numpy(distance)
+
+
+def skips_by_doubling(cell: Tensor) -> Tensor:
+    """[X, Y, Z] uint8, each cell's Chebyshev distance d to the nearest marked one, at most MAX_SKIP.
+
+    Of min(d, 2 R), what is less than R is min(d, R); where that is R, walking R cells towards the nearest marked one leaves
+    d - R, and no walk leaves less: the rest is the least min(d, R) within R cells.
+    """
+    distance = torch.where(cell, 0, 1).to(torch.uint8)
+    reach = 1
+    while reach < MAX_SKIP:
+        rest = distance
+        for axis in range(3):
+            rest = _least(rest, reach, axis)
+        distance = torch.where(distance < reach, distance, rest + reach)
+        reach *= 2
+    return distance.clamp(max=MAX_SKIP)
+
+
+def _least(values: Tensor, reach: int, axis: int) -> Tensor:
+    """The least of the values (uint8) that lie up to ``reach`` cells away along an axis, out of windows that double."""
+    count, width, span = values.shape[axis], 2 * reach + 1, 1
+    ends = [0] * 4 + [reach] * 2
+    values = torch.nn.functional.pad(values.movedim(axis, 0), ends, value=255)
+    while 2 * span <= width:
+        values, span = torch.minimum(values[:-span], values[span:]), 2 * span
+    return torch.minimum(values[:count], values[width - span :]).movedim(0, axis)
 
 
 def morton_sorted(coords: Tensor) -> Tensor:

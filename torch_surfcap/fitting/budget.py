@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import psutil
 import torch
 from torch import Tensor
 
-from torch_surfcap import ops
+from torch_surfcap import devices, ops
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.devices import CPU
 from torch_surfcap.field.field import DIAGONAL
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.settings import FitSettings
@@ -34,10 +34,11 @@ RAY_MARGIN = 1.3  # rays per pixel of the silhouettes
 
 @dataclass(frozen=True)
 class Budget:
-    """level_bytes: of each level's field, moments, gradients and rays. seconds: of the whole fit, within a factor of two."""
+    """level_bytes: of each level's field, moments, gradients and rays. seconds: of the whole fit on the CPU, within a factor
+    of two; None on another device."""
 
     level_bytes: list[int]
-    seconds: float
+    seconds: float | None
 
 
 def estimate(
@@ -60,7 +61,8 @@ def estimate(
         level_bytes.append(int(needed))
         step = settings.descent.step_of(level.last)
         samples += rays * level.iterations * SAMPLES_PER_RAY * DIAGONAL / step
-    return Budget(level_bytes, OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads())
+    seconds = OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads()
+    return Budget(level_bytes, seconds if store.device == CPU else None)
 
 
 def gradient_groups(numbers: int) -> int:
@@ -71,7 +73,8 @@ def gradient_groups(numbers: int) -> int:
 def partial_gradients(store: Tensor, accumulator: int) -> Tensor:
     """Memory for the partial gradients [groups, T, 4, 4, 4, P] of a field of floats or codes, in so many bits."""
     groups = gradient_groups(store.numel()) if store.is_floating_point() else CODE_GROUPS
-    return torch.empty(groups, *store.shape, dtype={32: torch.float32, 16: torch.float16}[accumulator])
+    dtype = {32: torch.float32, 16: torch.float16}[accumulator]
+    return torch.empty(groups, *store.shape, dtype=dtype, device=store.device)
 
 
 LESS = "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"
@@ -85,12 +88,18 @@ def bytes_per_number(numbers: int, settings: FitSettings) -> float:
     return (3 * settings.storage + groups * settings.accumulator) / 8
 
 
-def shortage(needed: int, remedy: str = LESS) -> str | None:
-    """What is missing for so many bytes, and the remedy; None where they are free."""
-    free = psutil.virtual_memory().available
-    if needed <= free:
-        return None
-    return f"needs {needed / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free: {remedy}"
+def shortage(needed: int, remedy: str = LESS, device: torch.device = CPU) -> str | None:
+    """What is missing on a device for so many bytes, and the remedy; None where they are free."""
+    free = devices.free_bytes(device)
+    return lack(needed, free, remedy) if needed > free else None
+
+
+def lack(needed: int, free: int, remedy: str = LESS) -> str:
+    """How so many bytes were not enough, where so many were guessed to be needed, and the remedy."""
+    there = f"{free / 2**30:.1f} GiB"
+    if needed > free:
+        return f"needs {needed / 2**30:.1f} GiB and {there} are free: {remedy}"
+    return f"needs more than the {there} that are free: {remedy}"
 
 
 def _surface_tiles(grid: TileGrid, within: Tensor) -> float:

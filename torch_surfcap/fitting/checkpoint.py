@@ -1,7 +1,8 @@
 """Checkpoints: all that the rest of a fit depends on, in one file that is complete or absent and holds no pickle.
 
 A fit that goes on from one ends with the same bits as one that was never stopped. What follows from the photographs
-(pictures at every size, rays through given pixels, their colours) is made again; what the fit found is kept.
+(pictures at every size, rays through given pixels, their colours) is made again; what the fit found is kept. A checkpoint
+of one device may be gone on from on another, with other random numbers.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting import view_color
 from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.color_gain import Exposure
+from torch_surfcap.fitting.late import Row
 from torch_surfcap.fitting.levels import Level
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.rays import rays_of
@@ -33,6 +35,7 @@ from torch_surfcap.fitting.stage import Stage, Studio, begin_adam, march_of
 from torch_surfcap.fitting.view_color import ViewColor
 from torch_surfcap.version import VERSION
 
+FREE = ("device", "images")  # where a fit runs may differ between it and its resumption
 VIEW = "view_"  # begins the names of what is the view-dependent colour's own
 
 
@@ -69,10 +72,18 @@ class Saved:
         return low, high
 
     def stage(self, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:
-        """The stage as it was; the studio gets its exposure and random numbers back."""
-        arrays, plain = {name: torch.from_numpy(a) for name, a in self.arrays.items()}, self.plain
+        """The stage as it was; the studio gets its exposure and random numbers back. On another kind of device, which makes
+        others, they begin anew, by seed, level and iteration."""
+        device, plain = torch.device(settings.device), self.plain
+        arrays = {
+            name: torch.from_numpy(a).to(device) for name, a in self.arrays.items() if name != "generator"
+        }
         studio.exposure = Exposure(arrays["gain"], arrays["bias"])
-        studio.generator.set_state(arrays["generator"])
+        if torch.device(plain["settings"]["device"]).type == device.type:
+            studio.generator.set_state(torch.from_numpy(self.arrays["generator"]))
+        else:
+            level, iteration = self.place
+            studio.generator.manual_seed(settings.seed + 1_000_003 * (1000 * level + iteration + 1))
         grid = self._grid(arrays)
         number = plain["number"]
         level, store = plan[number], arrays["store"]
@@ -99,6 +110,7 @@ class Saved:
             plain["compared"],
             plain["seconds"],
             self._view(arrays, settings),
+            [Row(known) for known in plain["waiting"]],
         )
 
     def _view(self, arrays: dict[str, Tensor], settings: FitSettings) -> ViewColor | None:
@@ -162,6 +174,7 @@ class Checkpoints:
             "rays_per_camera": np.diff(rays.camera_starts).tolist(),
             "box": torch.stack(box).tolist(),
             "record": asdict(record),
+            "waiting": [row.read() for row in stage.waiting],
         }
         arrays = {
             "pixels": rays.pixels,
@@ -180,7 +193,7 @@ class Checkpoints:
             kept = {"store": adam.store, "first": adam.first, "second": adam.second}
             kept |= {"table": grid.table, "coords": grid.coords}
             arrays |= {prefix + name: array for name, array in kept.items()}
-        data: dict[str, Any] = {name: array.numpy() for name, array in arrays.items()}
+        data: dict[str, Any] = {name: array.cpu().numpy() for name, array in arrays.items()}
         data["plain"] = np.frombuffer(json.dumps(plain).encode(), dtype=np.uint8)
         with atomic_write(self.path) as partial, open(partial, "wb") as file:
             np.savez(file, **data)
@@ -210,7 +223,7 @@ class Checkpoints:
         """Raises InputError where a checkpoint is of other settings or other cameras."""
         plain = json.loads(json.dumps(asdict(settings)))
         for name, value in saved.plain["settings"].items():
-            if name != "device" and plain.get(name) != value:
+            if name not in FREE and plain.get(name) != value:
                 raise InputError(
                     f"{self.path}: {name} is {value} there and {plain.get(name)} now, expected the same to resume"
                 )

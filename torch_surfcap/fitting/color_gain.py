@@ -33,9 +33,12 @@ class Exposure:
     bias: Tensor
 
     @staticmethod
-    def equal(cameras: int) -> Exposure:
+    def equal(cameras: int, device: torch.device | str = "cpu") -> Exposure:
         """All pictures as they are."""
-        return Exposure(torch.ones(cameras, 3), torch.zeros(cameras, 3))
+        return Exposure(torch.ones(cameras, 3, device=device), torch.zeros(cameras, 3, device=device))
+
+    def cpu(self) -> Exposure:
+        return Exposure(self.gain.cpu(), self.bias.cpu())
 
     def common(self, camera: int, colors: Tensor) -> Tensor:
         """Colours [M, 3] of a camera's pictures in the common exposure."""
@@ -64,17 +67,27 @@ class Equations:
 
     @staticmethod
     def of(
-        photograph: Tensor, field: Tensor, transmittance: Tensor | None = None, plate: Tensor | None = None
+        photograph: Tensor,
+        field: Tensor,
+        transmittance: Tensor | None = None,
+        plate: Tensor | None = None,
+        counted: Tensor | None = None,
     ) -> Equations:
         """The equations of one camera's rays.
 
         Args:
             photograph, field: [M, 3] the picture's colours P, and F. transmittance: [M]. plate: [M, 3]; without it the
-                rays are those that show the subject alone, T = 0.
+                rays are those that show the subject alone, T = 0. counted: [M] bool, which rays are taken; all by default.
         """
+        if (
+            counted is not None and photograph.device.type == "cpu"
+        ):  # elsewhere they would have to be numbered first
+            photograph, field, counted = photograph[counted], field[counted], None
         through = torch.zeros_like(photograph[:, :1]) if transmittance is None else transmittance[:, None]
         behind = torch.zeros_like(photograph) if plate is None else plate
         usable = (through < OPAQUE) & (photograph > SATURATED) & (photograph < 1 - SATURATED)
+        if counted is not None:
+            usable &= counted[:, None]
         by = torch.stack([field, (1 - through).expand_as(field)], -1)
         by = (by * usable[:, :, None]).double()
         matrix = torch.einsum("mci,mcj->cij", by, by)
@@ -95,13 +108,14 @@ class Equations:
             gauge: hold the means over the cameras at gain 1 and bias 0; else every camera is solved on its own, for
                 views that had no part in the field.
         """
-        matrix, right = self.matrix, self.right
+        matrix, right = self.matrix.clone(), self.right.clone()
         if not per_channel:
             matrix, right = matrix.sum(1, keepdim=True), right.sum(1, keepdim=True)
-        prior = RAY_DEVIATION**2 / torch.tensor([GAIN_DEVIATION, BIAS_DEVIATION], dtype=torch.float64) ** 2
-        matrix = matrix + torch.diag(prior)
-        right = right + prior * torch.tensor([1.0, 0.0], dtype=torch.float64)
-        slope, offset = torch.linalg.solve(matrix, right).expand(-1, 3, -1).unbind(-1)
+        # Numbers, not tensors, and no look at the result: a device would have to be waited for.
+        for entry, deviation in enumerate((GAIN_DEVIATION, BIAS_DEVIATION)):
+            matrix[..., entry, entry] += RAY_DEVIATION**2 / deviation**2
+        right[..., 0] += RAY_DEVIATION**2 / GAIN_DEVIATION**2
+        slope, offset = torch.linalg.solve_ex(matrix, right)[0].expand(-1, 3, -1).unbind(-1)
         gain = 1 / slope.clamp(1 / FARTHEST, FARTHEST)
         bias = -offset * gain
         if gauge:

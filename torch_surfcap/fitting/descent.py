@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,9 +11,10 @@ import torch
 from torch_surfcap import ops
 from torch_surfcap.field.field import MISSING
 from torch_surfcap.fitting.budget import partial_gradients
-from torch_surfcap.fitting.gathered import GatheredGradient
+from torch_surfcap.fitting.gathered import COSINES, GatheredGradient
+from torch_surfcap.fitting.late import Reading, Row, Stopwatch
 from torch_surfcap.fitting.settings import PARSIMONY_HUBER, FitSettings
-from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio
+from torch_surfcap.fitting.stage import Stage, Studio
 
 REFRESH = 8.0  # iterations at full rate after which the integration ranges are found anew: less than a voxel of motion
 
@@ -27,7 +29,11 @@ FIRST_GAINS = 10  # iterations before the first: until then the field is grey an
 def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dict[str, float]]:
     """Fits ``stage.store`` in place until the level ends, and yields a row of losses (each unweighted, and their weighted
     sum) per iteration; smoothness and parsimony of a view-dependent colour on its own grid are not among them. Between two
-    rows, all that the next one depends on lies in ``stage`` and ``studio``."""
+    rows, all that the next one depends on lies in ``stage`` and ``studio``.
+
+    On a GPU an iteration waits for nothing but new integration ranges, whose number the host must know: its row comes
+    after the next iteration was begun, and the rule that ends the level knows the losses up to the one before.
+    """
     loss = settings.losses
     ray_weights, voxel_weights = (
         [getattr(loss, name) for name in names] for names in (RAY_LOSSES, VOXEL_LOSSES)
@@ -35,6 +41,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     if not stage.level.last:
         voxel_weights[CURVATURE] *= loss.coarse_curvature
     store, grid, rays, rule, view = stage.store, stage.grid, stage.rays, stage.rule, stage.view
+    lag = 0 if store.device.type == "cpu" else 1
     frame = grid.frame(*MISSING[settings.opacity])
     arguments: dict[str, Any] = {
         "voxels": store,
@@ -51,8 +58,9 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     gathered = GatheredGradient(rays, grid, settings, stage.march) if settings.gradient == "gather" else None
     gradients = None if gathered else partial_gradients(store, settings.accumulator)
     samples = rays.samples(stage.march.step)
-    watch = Stopwatch(stage.seconds)
-    while not rule.ended:
+    watch = Stopwatch(stage.seconds, store.device)
+    while stage.goes_on:
+        iteration = rule.count + len(stage.waiting)
         if stage.moved >= REFRESH:
             stage.moved = 0.0
             rays.find_ranges(store, grid, settings.opacity, stage.march)
@@ -61,17 +69,18 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
                 gathered.lay_out()
             watch.lap("ranges")
         lattices = len(rays.cameras) if gathered else len(rays)
-        shift = (torch.rand(lattices, generator=studio.generator) - 0.5) * settings.descent.jitter
+        shift = torch.rand(lattices, generator=studio.generator, device=store.device) - 0.5
+        shift = shift * settings.descent.jitter
         if view:
             offset = view.seen_by(rays)
             arguments |= {"target": rays.target - offset, "background": rays.background - offset}
             watch.lap("view")
         arguments["shift"] = gathered.per_ray(shift) if gathered else shift
-        cosines: dict[str, float] = {}
+        cosines = []
         if gathered:
             ray_losses, gradient, color, transmittance, depth = gathered.step(arguments, shift, watch)
             if rule.scale != stage.compared:
-                cosines, stage.compared = gathered.cosines(arguments), rule.scale
+                cosines, stage.compared = [gathered.cosines(arguments)], rule.scale
                 watch.lap("compare")
         else:
             ray_losses, gradient, color, transmittance, depth = ops.photometric_step(
@@ -92,16 +101,20 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
         stage.adam.step(gradient, rule.scale)
         stage.moved += rule.scale
         watch.lap("adam")
-        if studio.gains and (stage.number > 0 or rule.count >= FIRST_GAINS) and rule.count % GAINS_EVERY == 0:
+        if studio.gains and (stage.number > 0 or iteration >= FIRST_GAINS) and iteration % GAINS_EVERY == 0:
             studio.fit_exposure(stage, color, transmittance)
             watch.lap("gains")
-        losses = torch.cat([ray_losses, voxel_losses])
-        weights = losses.new_tensor([*ray_weights, *voxel_weights])
-        row = {
+        known = {
             "samples": samples,
-            "iteration": float(rule.count),
-            "loss": float(losses @ weights),
+            "iteration": float(iteration),
+            "loss": math.nan,  # until it is read
             "rate": rule.scale,
         }
-        rule.goes_on(row["loss"])
-        yield row | dict(zip(RAY_LOSSES + VOXEL_LOSSES, losses.tolist(), strict=True)) | cosines
+        values = Reading(torch.cat([ray_losses, voxel_losses, *cosines]))
+        names = RAY_LOSSES + VOXEL_LOSSES + COSINES * len(cosines)
+        stage.waiting.append(Row(known, values, names, [*ray_weights, *voxel_weights]))
+        while len(stage.waiting) > lag:
+            yield stage.told()
+    while stage.waiting:
+        yield stage.told()
+    watch.stop()

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
-from torch_surfcap import ops
+from torch_surfcap import devices, ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import prepare
 from torch_surfcap.data.floor import find_floor
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
-from torch_surfcap.fitting.budget import Budget, estimate, shortage
-from torch_surfcap.fitting.checkpoint import Checkpoints, Record
+from torch_surfcap.fitting.budget import Budget, estimate, lack, shortage
+from torch_surfcap.fitting.checkpoint import Checkpoints, Record, Saved
 from torch_surfcap.fitting.descent import descend
+from torch_surfcap.fitting.late import Stopwatch
 from torch_surfcap.fitting.levels import Level, first_field, plan_levels, subject_box
 from torch_surfcap.fitting.settings import FitSettings
-from torch_surfcap.fitting.stage import Stage, Stopwatch, Studio, begin_stage, next_stage, open_studio
+from torch_surfcap.fitting.stage import Outcome, Stage, Studio, begin_stage, next_stage, open_studio
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,7 +31,8 @@ if TYPE_CHECKING:
 class FitResult:
     """What a fit gives.
 
-    field, mesh: the surface. history: one row per iteration, with its level. gain, bias: [N, 3] per camera.
+    field, mesh: the surface, the field on the device of the fit, or on the CPU where memory ran out there. history: one
+    row per iteration, with its level. gain, bias: [N, 3] per camera.
     chosen: what the program chose and why. seconds: per stage and level. warnings: one sentence each. resumed_from:
     [level, iteration] of the checkpoint that the fit began with, None without one. iterations_run: since then.
     """
@@ -79,8 +82,8 @@ def fit(
         settings: see :class:`torch_surfcap.fitting.settings.FitSettings`.
 
     Raises:
-        InputError: no silhouettes, no common view volume, an empty hull, no memory for even the first level, a
-            checkpoint of another fit.
+        InputError: a device that cannot be used, no silhouettes, no common view volume, an empty hull, no memory for even
+            the first level, a checkpoint of another fit.
         TypeError, ValueError: unknown or impossible settings.
 
     >>> import torch_surfcap as sc
@@ -88,9 +91,15 @@ def fit(
     >>> result.mesh.export("mesh.ply")  # doctest: +SKIP
     """
     s = FitSettings.of(**settings)
-    report = progress or (lambda _: None)
-    if s.device != "cpu":
-        raise InputError(f"device: found {s.device}, expected cpu: this build has no CUDA kernels")
+    device = devices.resolve(s.device)
+    with devices.current(device):
+        return _fit(capture, progress or (lambda _: None), checkpoints, replace(s, device=str(device)))
+
+
+def _fit(
+    capture: Capture, report: Callable[[Progress], None], checkpoints: Checkpoints | None, s: FitSettings
+) -> FitResult:
+    """See :func:`fit`."""
     seconds: dict[str, Any] = {}
     watch = Stopwatch(seconds)
     capture = prepare(capture)
@@ -104,54 +113,25 @@ def fit(
     floor = find_floor(capture, box) if s.floor == "auto" else None
     watch.lap("floor")
     studio = open_studio(capture, s, plan[0].halvings, floor)
-    so_far = Record(list(capture.warnings))
-    if saved is None:
-        grid, store = first_field(studio.pictures[-1], box, plan[0].voxel_size, s, floor)
-        watch.lap("hull")
-        budget = estimate(capture, plan, grid, store, s)
-        so_far.level_bytes = budget.level_bytes
-        report(Progress(0, len(plan), plan[0], 0, {}, budget))
-        missing = short_of(plan, 0, so_far.level_bytes)
-        if missing:
-            raise InputError(f"memory: {missing}")
-        stage = begin_stage(s, plan, 0, grid, store, studio)
-    else:
-        stage, so_far = saved.stage(s, plan, studio), Record(**saved.plain["record"])
-        watch.lap("resume")
+    so_far = Record(list(capture.warnings)) if saved is None else Record(**saved.plain["record"])
+    run = _Run(s, capture, box, plan, studio, so_far, saved, checkpoints, report)
     resumed = len(so_far.history)
-
-    while True:
-        for row in descend(stage, studio, s):
-            so_far.history.append({"level": float(stage.number)} | row)
-            report(Progress(stage.number, len(plan), stage.level, len(stage.store) * ops.TILE**3, row))
-            if checkpoints is not None and checkpoints.due():
-                checkpoints.save(s, capture, box, stage, studio, so_far)
-        so_far.seconds.append(stage.seconds)
-        if stage.number == len(plan) - 1:
-            break
-        missing = short_of(plan, stage.number + 1, so_far.level_bytes)
-        if missing:
-            so_far.warnings.append(f"{missing}; the fit ends with the level before")
-            break
-        stage = next_stage(stage, s, plan, studio)
-        if checkpoints is not None:
-            checkpoints.save(s, capture, box, stage, studio, so_far)
+    outcome = run.outcome(watch)
     watch.lap("fit")
-    step = stage.march.step / stage.grid.voxel_size
-    view = None if stage.view is None else stage.view.field()
-    surface = SurfaceField(stage.decoded(s.opacity, floor), stage.grid, s.opacity, step, view)
+    surface = outcome.surface(s.opacity, floor)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:
         raise InputError("surface: the fit ended without any, expected a subject inside the silhouettes")
     seconds["levels"] = so_far.seconds
+    exposure = studio.exposure = studio.exposure.cpu()
     return FitResult(
         surface,
         mesh,
         so_far.history,
-        studio.exposure.gain,
-        studio.exposure.bias,
-        _chosen(s, box, stage, plan, studio),
+        exposure.gain,
+        exposure.bias,
+        _chosen(s, box, outcome, plan, studio),
         seconds,
         so_far.warnings,
         None if saved is None else saved.place,
@@ -159,27 +139,108 @@ def fit(
     )
 
 
-def short_of(plan: list[Level], number: int, level_bytes: list[int]) -> str | None:
-    """What a level lacks, None where there is memory for it."""
-    missing = shortage(level_bytes[number])
-    return (
-        missing and f"level {number + 1} of {len(plan)} (voxels of {plan[number].voxel_size:.4g}) {missing}"
-    )
+@dataclass
+class _Run:
+    """The levels of a fit, one after the other."""
+
+    settings: FitSettings
+    capture: Capture
+    box: tuple[Tensor, Tensor]
+    plan: list[Level]
+    studio: Studio
+    so_far: Record
+    saved: Saved | None
+    checkpoints: Checkpoints | None
+    report: Callable[[Progress], None]
+
+    def outcome(self, watch: Stopwatch) -> Outcome:
+        """Of the last level, or of the one before that for which there is no memory.
+
+        Raises InputError where that is the first one, or the first one after a checkpoint.
+        """
+        s, device, before = self.settings, torch.device(self.settings.device), None
+        number = 0 if self.saved is None else self.saved.place[0]
+        try:
+            stage = self._begin(watch)
+            self._descend(stage)
+        except torch.OutOfMemoryError as error:
+            raise InputError(f"memory: {self._short_of(number, ran_out=True)}") from error
+        while number < len(self.plan) - 1:
+            number += 1
+            missing = self._short_of(number)
+            if missing is None:
+                # The level before is needed again only where memory may run out in the midst of this one.
+                before = Outcome.of(stage).to(devices.CPU) if devices.may_run_out(device) else None
+                try:
+                    stage = next_stage(stage, s, self.plan, self.studio)
+                    self._save(stage)
+                    self._descend(stage)
+                except torch.OutOfMemoryError:
+                    missing = self._short_of(number, ran_out=True)
+            if missing is not None:
+                self.so_far.warnings.append(f"{missing}; the fit ends with the level before")
+                return Outcome.of(stage) if before is None or stage.number < number else before
+        return Outcome.of(stage)
+
+    def _begin(self, watch: Stopwatch) -> Stage:
+        """The first stage, out of the hull or out of the checkpoint."""
+        s, plan, studio, so_far = self.settings, self.plan, self.studio, self.so_far
+        if self.saved is not None:
+            studio.keep_pictures(s.images, so_far.level_bytes)
+            stage = self.saved.stage(s, plan, studio)
+            watch.lap("resume")
+            return stage
+        grid, store = first_field(studio.pictures[-1], self.box, plan[0].voxel_size, s, studio.floor)
+        watch.lap("hull")
+        budget = estimate(self.capture, plan, grid, store, s)
+        so_far.level_bytes = budget.level_bytes
+        self.report(Progress(0, len(plan), plan[0], 0, {}, budget))
+        missing = self._short_of(0)
+        if missing is not None:
+            raise InputError(f"memory: {missing}")
+        studio.keep_pictures(s.images, so_far.level_bytes)
+        return begin_stage(s, plan, 0, grid, store, studio)
+
+    def _descend(self, stage: Stage) -> None:
+        """All that is left of a level."""
+        for row in descend(stage, self.studio, self.settings):
+            self.so_far.history.append({"level": float(stage.number)} | row)
+            voxels = len(stage.store) * ops.TILE**3
+            self.report(Progress(stage.number, len(self.plan), stage.level, voxels, row))
+            if self.checkpoints is not None and self.checkpoints.due():
+                self._save(stage)
+        self.so_far.seconds.append(stage.seconds)
+
+    def _save(self, stage: Stage) -> None:
+        if self.checkpoints is not None:
+            s, capture, so_far = self.settings, self.capture, self.so_far
+            self.checkpoints.save(s, capture, self.box, stage, self.studio, so_far)
+
+    def _short_of(self, number: int, ran_out: bool = False) -> str | None:
+        """What a level lacks, None where there is memory for it; ``ran_out``: where there was not."""
+        device, plan = torch.device(self.settings.device), self.plan
+        known = self.so_far.level_bytes
+        needed = known[number] if known else 0  # not yet known while the first field is made
+        missing = lack(needed, devices.free_bytes(device)) if ran_out else shortage(needed, device=device)
+        return (
+            missing
+            and f"level {number + 1} of {len(plan)} (voxels of {plan[number].voxel_size:.4g}) {missing}"
+        )
 
 
 def _chosen(
-    s: FitSettings, box: tuple[Tensor, Tensor], stage: Stage, plan: list[Level], studio: Studio
+    s: FitSettings, box: tuple[Tensor, Tensor], outcome: Outcome, plan: list[Level], studio: Studio
 ) -> dict[str, Any]:
     """What the fit chose, and why."""
-    cut = "memory" if stage.number < len(plan) - 1 else None
+    cut = "memory" if outcome.number < len(plan) - 1 else None
     return {
         "sh_degree": {"value": s.degree, "reason": "default" if s.sh_degree is None else "given"},
         "voxel": {
-            "value": stage.grid.voxel_size,
+            "value": outcome.grid.voxel_size,
             "reason": cut or ("a pixel's footprint" if s.voxel is None else "given"),
         },
         "levels": {
-            "value": stage.number + 1,
+            "value": outcome.number + 1,
             "reason": cut or ("size of the pictures" if s.levels is None else "given"),
         },
         "box": {

@@ -18,8 +18,9 @@ from torch_surfcap.fitting.rays import RayBatch
 from torch_surfcap.fitting.settings import FitSettings
 
 if TYPE_CHECKING:
-    from torch_surfcap.fitting.stage import Stopwatch
+    from torch_surfcap.fitting.late import Stopwatch
 
+COSINES = ("cosine_opacity", "cosine_color")
 LARGEST = torch.finfo(torch.float8_e5m2).max
 
 
@@ -43,8 +44,10 @@ class GatheredGradient:
         bound *= float(rays.weight.max()) if len(rays) else 0.0
         self.exponent = math.floor(math.log2(LARGEST / bound)) if self.narrow and bound > 0 else 0
         cameras = rays.cameras
-        self.matrices = (cameras.K @ cameras.world_to_camera[:, :3, :3]).float()
-        self.centers = cameras.centers.float()
+        device = rays.origins.device
+        self.matrices = (cameras.K @ cameras.world_to_camera[:, :3, :3]).float().to(device)
+        self.centers = cameras.centers.float().to(device)
+        self.rays_per_camera = torch.tensor(rays.camera_starts, device=device).diff()
         self.windows, self.window_rays = camera_windows(rays.pixels, rays.camera_starts, cameras.size[:, 0])
         self.gradient = rays.origins.new_empty(0)
         self.lay_out()
@@ -56,11 +59,11 @@ class GatheredGradient:
             self.rays.ranges, self.march.step, self.rays.bundle, len(self.rays)
         )
         dtype = torch.uint8 if self.narrow else self.rays.origins.dtype
-        self.slots = torch.empty(int(self.starts[-1]), 4, dtype=dtype)
+        self.slots = torch.empty(int(self.starts[-1]), 4, dtype=dtype, device=self.starts.device)
 
     def per_ray(self, shift: Tensor) -> Tensor:
         """The cameras' shifts [N] for every ray [R]."""
-        return shift.repeat_interleave(torch.tensor(self.rays.camera_starts).diff())
+        return shift.repeat_interleave(self.rays_per_camera, output_size=len(self.rays))
 
     def step(self, arguments: dict[str, Any], shift: Tensor, watch: Stopwatch) -> tuple[Tensor, ...]:
         """What ``ops.photometric_step`` returns, with the gathered gradient [T, 4, 4, 4, P].
@@ -96,18 +99,17 @@ class GatheredGradient:
         watch.lap("gather")
         return losses, self.gradient, *rendering
 
-    def cosines(self, arguments: dict[str, Any]) -> dict[str, float]:
-        """Of the angles between the last step's gradient and the exact one, for the opacity value and for colour."""
+    def cosines(self, arguments: dict[str, Any]) -> Tensor:
+        """[2] float64, of the angles between the last step's gradient and the exact one, for the opacity value and for
+        colour."""
         exact = ops.photometric_step(**arguments, ranges=self.rays.ranges)[1]
-        parts = {"cosine_opacity": slice(0, 1), "cosine_color": slice(1, None)}
-        return {
-            name: float(
-                torch.cosine_similarity(
-                    self.gradient[..., part].double().flatten(), exact[..., part].double().flatten(), dim=0
-                )
+        between = [
+            torch.cosine_similarity(
+                self.gradient[..., part].double().flatten(), exact[..., part].double().flatten(), dim=0
             )
-            for name, part in parts.items()
-        }
+            for part in (slice(0, 1), slice(1, None))
+        ]
+        return torch.stack(between)
 
 
 def slot_rows(ranges: tuple[Tensor, Tensor], step: float, bundle: int, rays: int) -> tuple[Tensor, Tensor]:
@@ -127,7 +129,7 @@ def slot_rows(ranges: tuple[Tensor, Tensor], step: float, bundle: int, rays: int
 def camera_windows(pixels: Tensor, camera_starts: list[int], widths: Tensor) -> tuple[Tensor, Tensor]:
     """``windows [N, 4]`` and ``window_rays`` of ``ops.gather_gradient`` for rays through these pixels [R], numbered row by
     row in pictures of these widths [N]."""
-    windows, maps = [], []
+    windows, maps = [], [torch.zeros(0, dtype=torch.int32, device=pixels.device)]
     for (begin, end), across in zip(itertools.pairwise(camera_starts), widths.tolist(), strict=True):
         if begin == end:
             windows.append([0, 0, 0, 0])
@@ -135,8 +137,9 @@ def camera_windows(pixels: Tensor, camera_starts: list[int], widths: Tensor) -> 
         column, row = pixels[begin:end].long() % across, pixels[begin:end].long() // across
         left, top = int(column.min()) - 1, int(row.min()) - 1
         width, height = int(column.max()) + 2 - left, int(row.max()) + 2 - top
-        window = torch.full((height, width), -1, dtype=torch.int32)
-        window[row - top, column - left] = torch.arange(begin, end, dtype=torch.int32)
+        window = torch.full((height, width), -1, dtype=torch.int32, device=pixels.device)
+        numbers = torch.arange(begin, end, dtype=torch.int32, device=pixels.device)
+        window[row - top, column - left] = numbers
         windows.append([left, top, width, height])
         maps.append(window.flatten())
-    return torch.tensor(windows).view(-1, 4), torch.cat(maps) if maps else torch.zeros(0, dtype=torch.int32)
+    return torch.tensor(windows, device=pixels.device).view(-1, 4), torch.cat(maps)

@@ -93,15 +93,18 @@ def first_field(
     corner = low - MARGIN * voxel_size
     size = [int(n) for n in torch.ceil((high - low + 2 * MARGIN * voxel_size) / edge)]
     remedy = "voxels 1.3 times as large or one level more halve it"
-    missing = shortage(DENSE_BYTES * ops.TILE**3 * math.prod(size), remedy)
+    device = torch.device(settings.device)
+    missing = shortage(DENSE_BYTES * ops.TILE**3 * math.prod(size), remedy, device)
     if missing:
         raise InputError(f"memory: the first level (voxels of {voxel_size:.4g}) {missing}")
     x, y, z = corner.tolist()
-    steps = [(torch.arange(n * ops.TILE, dtype=torch.float64) + 0.5) * voxel_size for n in size]
-    points = torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + corner
-    hull = binary_dilation(Silhouettes.of(capture, grow=1).occupied(points).numpy())
+    counts = (torch.arange(n * ops.TILE, dtype=torch.float64, device=device) for n in size)
+    steps = [(count + 0.5) * voxel_size for count in counts]
+    points = torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + corner.to(device)
+    # What follows is small, and scipy's: it is done on the host.
+    hull = binary_dilation(Silhouettes.of(capture, grow=1).occupied(points).cpu().numpy())
     if floor is not None:
-        hull &= (floor.height(points) > 0).numpy()
+        hull &= (floor.height(points) > 0).cpu().numpy()
     if not hull.any():
         raise InputError("silhouettes: the visual hull is empty inside the box, expected a subject there")
     distance = torch.from_numpy(distance_transform_edt(~hull) - distance_transform_edt(hull)).float()
@@ -120,7 +123,7 @@ def first_field(
     store = torch.zeros(len(grid.coords), 4, 4, 4, ops.pitch(settings.voxel_degree))
     store[..., 0] = tiles[i, j, k]
     store[..., 1:4] = 0.5
-    return grid, store
+    return grid.to(device), store.to(device)
 
 
 def _tilewise(voxels: Tensor) -> Tensor:
@@ -163,7 +166,8 @@ def cut_at_floor(grid: TileGrid, store: Tensor, opacity: str, floor: Floor | Non
     if floor is None:
         return
     reach = ops.TILE * grid.voxel_size * math.sqrt(3)
-    low = torch.tensor(grid.origin, dtype=torch.float64) + grid.coords.double() * ops.TILE * grid.voxel_size
+    origin = torch.tensor(grid.origin, dtype=torch.float64, device=store.device)
+    low = origin + grid.coords.double() * ops.TILE * grid.voxel_size
     near = (floor.height(low) < reach).nonzero()[:, 0]
     height = (floor.height(voxel_centers(grid, near)) / grid.voxel_size).to(store.dtype)
     value = store[near, ..., 0]

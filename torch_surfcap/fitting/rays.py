@@ -106,7 +106,7 @@ class RayBatch:
                 cameras.append(Equations.of(photograph, field, through, plate))
             else:
                 within = self.mask[part] > WITHIN
-                cameras.append(Equations.of(photograph[within], color[part][within]))
+                cameras.append(Equations.of(photograph, color[part], counted=within))
         return Equations.joined(cameras)
 
 
@@ -116,14 +116,15 @@ def shared_ranges(ranges: tuple[Tensor, Tensor], bundle: int) -> tuple[Tensor, T
         return ranges
     offsets, stretches = ranges
     lists = -(-(len(offsets) - 1) // bundle)
-    ray = torch.arange(len(offsets) - 1).repeat_interleave(offsets.diff())
+    ray = torch.arange(len(offsets) - 1, device=offsets.device).repeat_interleave(offsets.diff())
     # Bundle by bundle along one line, far enough apart that a range of one never meets one of the next.
     apart = float(stretches.max()) + 1.0 if len(stretches) else 1.0
     moved = stretches.double() + (ray // bundle)[:, None] * apart
     begin, order = moved[:, 0].sort(stable=True)
     reached = moved[order, 1].cummax(0).values
-    starts = torch.cat([torch.ones(len(begin[:1]), dtype=torch.bool), begin[1:] > reached[:-1]])
-    ends = torch.cat([starts[1:], torch.ones(len(begin[:1]), dtype=torch.bool)])
+    one = torch.ones_like(begin[:1], dtype=torch.bool)
+    starts = torch.cat([one, begin[1:] > reached[:-1]])
+    ends = torch.cat([starts[1:], one])
     of_bundle = (ray // bundle)[order][starts]
     united = torch.stack([begin[starts], reached[ends]], 1) - of_bundle[:, None] * apart
     counts = torch.bincount(of_bundle, minlength=lists)
@@ -131,8 +132,8 @@ def shared_ranges(ranges: tuple[Tensor, Tensor], bundle: int) -> tuple[Tensor, T
 
 
 def picture_at(picture: Tensor, pixels: Tensor) -> Tensor:
-    """Colours [M, 3], float32 in [0, 1], of a picture [H, W, 3] at the row-major numbers [M] of pixels."""
-    return float_tensor(picture.reshape(-1, 3)[pixels.long()])
+    """Colours [M, 3], float32 in [0, 1], of a picture [H, W, 3] at the row-major numbers [M] of pixels, on their device."""
+    return float_tensor(picture.to(pixels.device).reshape(-1, 3)[pixels.long()])
 
 
 def gather_rays(
@@ -153,7 +154,7 @@ def gather_rays(
     """
     assert capture.masks is not None
     if visit == "box":
-        everywhere = [_blocked(torch.ones_like(mask).nonzero()) for mask in capture.masks]
+        everywhere = [_blocked(torch.ones_like(mask).nonzero()).to(store.device) for mask in capture.masks]
         widths = capture.cameras.size[:, 0].tolist()
         pixels = [(i[:, 0] * w + i[:, 1]).int() for i, w in zip(everywhere, widths, strict=True)]
         return rays_of(capture, grid, pixels, None)
@@ -162,7 +163,7 @@ def gather_rays(
     chosen, counts, ranges = [], [], []
     for i, mask in enumerate(capture.masks):
         reach = int(torch.ceil(MARGIN * per_voxel[i])) + 1
-        index = _blocked((grown(mask, reach) > 0).nonzero())
+        index = _blocked((grown(mask, reach) > 0).nonzero()).to(store.device)
         origins, directions = _rays(capture, i, index)
         offsets, stretches = finder.ranges(origins, directions)
         passes = offsets.diff()
@@ -173,7 +174,8 @@ def gather_rays(
         chosen.append((index[hit, 0] * mask.shape[1] + index[hit, 1]).int())
         counts.append(passes[hit])
         ranges.append(stretches)
-    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), torch.cat(counts).cumsum(0)])
+    passing = torch.cat(counts)
+    offsets = torch.cat([passing.new_zeros(1), passing.cumsum(0)])
     found = shared_ranges((offsets, torch.cat(ranges)), bundle) if visit == "ranges" else None
     return rays_of(capture, grid, chosen, found, bundle)
 
@@ -185,15 +187,16 @@ def rays_of(
     ranges: tuple[Tensor, Tensor] | None,
     bundle: int = 1,
 ) -> RayBatch:
-    """The rays through pixels, given per camera by their row-major numbers, still without colours."""
+    """The rays through pixels, given per camera by their row-major numbers, on their device, still without colours."""
     assert capture.masks is not None
     per_voxel = pixels_per_voxel(capture, grid)
     parts, starts = [], [0]
     for i, (mask, chosen) in enumerate(zip(capture.masks, pixels, strict=True)):
         width = mask.shape[1]
         index = torch.stack([chosen.long() // width, chosen.long() % width], 1)
-        weight = torch.full((len(index),), 1.0 / (len(capture) * float(per_voxel[i]) ** 2))
-        parts.append((*_rays(capture, i, index), mask.flatten()[chosen.long()], weight))
+        known = mask.to(chosen.device).flatten()[chosen.long()]
+        weight = torch.full_like(known, 1.0 / (len(capture) * float(per_voxel[i]) ** 2))
+        parts.append((*_rays(capture, i, index), known, weight))
         starts.append(starts[-1] + len(index))
     origins, directions, mask, weight = (torch.cat(c).contiguous() for c in zip(*parts, strict=True))
     target, background = torch.empty_like(origins), torch.empty_like(origins)

@@ -81,6 +81,7 @@ CHOICES = {
     "floor": ("auto", "off"),
     "start": ("hull", "constant"),
     "upscale": ("plain", "sqrt"),
+    "images": ("auto", "device", "host"),
 }
 SAMPLE_TARGETS = ("observed", "rendered")
 VISITS = ("ranges", "cells", "box")
@@ -105,6 +106,9 @@ class FitSettings:
     start:     "hull": the first field falls off at the hull's surface; "constant": a transparency is the same fog inside
     upscale:   "plain" or "sqrt": a transparency at a change of level stays, or becomes its root, so that two fine voxels
                stop as much light as the coarse one did
+    device:    "cpu", "cuda", "cuda:1", ..., or "auto": a GPU where this build and torch can use one
+    images:    where the photographs of all sizes are kept: on the "device", or in "host" memory, from where they go to the
+               device camera by camera whenever they are read; "auto": there if they fit beside the levels
     gradient:  "scatter", the exact gradient of the ray terms, or "gather", the paper's eq. 19: close to it, and without
                sums that threads share
     lattice:   32 or 8, bits of a number of the samples' gradients that "gather" keeps
@@ -130,6 +134,7 @@ class FitSettings:
     upscale: str = "plain"
     seed: int = 0
     device: str = "cpu"
+    images: str = "auto"
     gradient: str = "scatter"
     lattice: int = 32
     threshold: float | None = None

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from torch_surfcap import codes, ops
+from torch_surfcap import codes, devices, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.floor import Floor
-from torch_surfcap.field.field import MISSING, SLOPE
+from torch_surfcap.field.field import MISSING, SLOPE, SurfaceField
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.color_gain import Exposure
+from torch_surfcap.fitting.late import Row, Stopwatch
 from torch_surfcap.fitting.levels import Level, cut_at_floor, next_level
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.rays import RayBatch, choose_backdrop, gather_rays
 from torch_surfcap.fitting.settings import FitSettings
-from torch_surfcap.fitting.view_color import ViewColor, begin_view_color
+from torch_surfcap.fitting.view_color import KIND, ViewColor, begin_view_color
+
+PICTURES_SHARE = 0.8  # of the device's memory that the largest level leaves, for pictures
 
 
 @dataclass
@@ -40,6 +42,16 @@ class Studio:
     generator: torch.Generator
     floor: Floor | None = None
 
+    def keep_pictures(self, images: str, level_bytes: list[int]) -> None:
+        """Takes the pictures to the device where ``images`` says so; "auto": if they fit beside the largest level."""
+        device = self.exposure.gain.device
+        needed = sum(capture.nbytes for capture in self.pictures)
+        if images == "auto":
+            left = devices.free_bytes(device) - max(level_bytes)
+            images = "device" if needed <= PICTURES_SHARE * left else "host"
+        if images == "device":
+            self.pictures = [capture.on(device) for capture in self.pictures]
+
     def fit_exposure(self, stage: Stage, color: Tensor, transmittance: Tensor) -> None:
         """Takes the cameras' gains out of renderings of a stage's rays, [R, 3] and [R], and exposes the rays anew."""
         capture = self.pictures[stage.level.halvings]
@@ -56,7 +68,7 @@ class Stage:
     codes (see ``torch_surfcap.codes``). moved:
     iterations at full rate since the integration ranges were found. compared: the rate at which the gathered gradient
     was held against the exact one last. seconds: spent per kind of work. view: the view-dependent colour, where it is not in
-    the records.
+    the records. waiting: rows of the iterations that were not told of yet.
     """
 
     number: int
@@ -71,16 +83,54 @@ class Stage:
     compared: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
     view: ViewColor | None = None
+    waiting: list[Row] = field(default_factory=list)
 
     def table(self, settings: FitSettings) -> Tensor:
         """The grid's table, where the whole box is visited without what it says about empty space."""
         return self.grid.table.clamp(min=ops.OUTSIDE) if settings.descent.visit == "box" else self.grid.table
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether another iteration follows those done, told of or not."""
+        return not self.rule.ended and self.rule.count + len(self.waiting) < self.rule.limit
+
+    def told(self) -> dict[str, float]:
+        """The first row that waits; the rule learns its loss."""
+        row = self.waiting.pop(0).read()
+        self.rule.goes_on(row["loss"])
+        return row
+
+
+@dataclass
+class Outcome:
+    """What a level leaves. number, grid, store: of the stage. step: between samples, voxels. view: grid and records of the
+    view-dependent colour, where it has its own."""
+
+    number: int
+    grid: TileGrid
+    store: Tensor
+    step: float
+    view: tuple[TileGrid, Tensor] | None
+
+    @staticmethod
+    def of(stage: Stage) -> Outcome:
+        view = None if stage.view is None else (stage.view.grid, stage.view.store)
+        return Outcome(stage.number, stage.grid, stage.store, stage.march.step / stage.grid.voxel_size, view)
+
+    def to(self, device: torch.device) -> Outcome:
+        view = self.view and (self.view[0].to(device), self.view[1].to(device))
+        return Outcome(self.number, self.grid.to(device), self.store.to(device), self.step, view)
 
     def decoded(self, opacity: str, floor: Floor | None) -> Tensor:
         """The records in floats, cut at the floor; those of the stage may be so, too."""
         store = codes.decode(self.store, *MISSING[opacity])
         cut_at_floor(self.grid, store, opacity, floor)
         return store
+
+    def surface(self, opacity: str, floor: Floor | None) -> SurfaceField:
+        """As a module."""
+        view = self.view and SurfaceField(self.view[1], self.view[0], KIND)
+        return SurfaceField(self.decoded(opacity, floor), self.grid, opacity, self.step, view)
 
 
 def march_of(settings: FitSettings, level: Level) -> March:
@@ -123,32 +173,22 @@ def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: F
     pictures = [capture]
     while len(pictures) <= halvings:
         pictures.append(pictures[-1].halved())
-    generator = torch.Generator().manual_seed(settings.seed)
-    equal = Exposure.equal(len(capture))
+    generator = torch.Generator(settings.device).manual_seed(settings.seed)
+    equal = Exposure.equal(len(capture), settings.device)
+    backdrop = choose_backdrop(capture)
+    backdrop = None if backdrop is None else backdrop.to(settings.device)
     per_channel = settings.gain_per == "channel"
     gains = settings.gains != "off"
-    return Studio(pictures, choose_backdrop(capture), equal, gains, per_channel, generator, floor)
+    return Studio(pictures, backdrop, equal, gains, per_channel, generator, floor)
 
 
 def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:
     """The level after one that is done."""
-    watch = Stopwatch({})
-    done = stage.decoded(settings.opacity, studio.floor)
+    watch = Stopwatch({}, stage.store.device)
+    done = Outcome.of(stage).decoded(settings.opacity, studio.floor)
     grid, store = next_level(stage.grid, done, settings, stage.rays, stage.march)
     following = begin_stage(settings, plan, stage.number + 1, grid, store, studio, stage.view)
     watch.lap("prepare")
+    watch.stop()
     following.seconds |= watch.seconds
     return following
-
-
-class Stopwatch:
-    """Adds up seconds by kind of work."""
-
-    def __init__(self, seconds: dict[str, float]) -> None:
-        self.seconds = seconds
-        self.last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now

@@ -70,7 +70,7 @@ class ViewColor:
         # Samples that are held against the rendering move with it.
         share = losses.photo + (losses.sample if losses.sample_target == "observed" else 0.0)
         pull = share * rays.weight * (1 - transmittance)
-        by_value = torch.zeros(len(rays), 4)
+        by_value = residual.new_zeros(len(rays), 4)
         torch.mul(residual.clamp(-losses.huber, losses.huber), pull[:, None], out=by_value[:, 1:])
         table, frame = self.grid.table, frame_of(self.grid)
         read = (self.store, table, frame, self.points(rays), rays.directions)
@@ -103,12 +103,14 @@ def begin_view_color(
         return None
     coarse = covering(grid, settings.view_spacing)
     if before is None:
-        records = torch.zeros(len(coarse.coords), ops.TILE, ops.TILE, ops.TILE, ops.pitch(settings.degree))
+        records = store.new_zeros(
+            len(coarse.coords), ops.TILE, ops.TILE, ops.TILE, ops.pitch(settings.degree)
+        )
     else:
         whole = (before.store, before.grid.table, frame_of(before.grid))
         records = ops.upscale(*whole, coarse.places, frame_of(coarse))
     frame = grid.frame(*MISSING[settings.opacity])
-    shift, black = torch.zeros(len(rays)), torch.zeros(len(rays), 3)
+    shift, black = torch.zeros_like(rays.mask), torch.zeros_like(rays.origins)
     origins, directions = rays.origins, rays.directions
     _, _, depth = ops.march_forward(store, grid.table, frame, origins, directions, shift, black, *march)
     return ViewColor(coarse, records, begin_adam(records, settings), depth.nan_to_num(0.0))
@@ -126,7 +128,8 @@ def covering(grid: TileGrid, spacing: int) -> TileGrid:
     low = grid.coords.long() * ops.TILE - spacing // 2
     high = low + ops.TILE + spacing - 1
     ends = torch.stack([low, high]).div(edge, rounding_mode="floor") + 1  # one tile more before the box
-    stored = torch.zeros([-(-ops.TILE * n // edge) + 2 for n in grid.size], dtype=torch.bool)
+    size = [-(-ops.TILE * n // edge) + 2 for n in grid.size]
+    stored = torch.zeros(size, dtype=torch.bool, device=grid.coords.device)
     for corner in range(8):
         x, y, z = (ends[corner >> axis & 1, :, axis] for axis in range(3))
         stored[x, y, z] = True
