@@ -22,6 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
+from tests.fitting.made_up_device import DEVICE, Moment
 from tests.fitting.sphere import ball
 from tests.fitting.stages import begun
 from torch_surfcap import Cameras, Capture
@@ -30,7 +31,6 @@ from torch_surfcap.fitting.adam import TileAdam
 from torch_surfcap.fitting.gathered import GatheredGradient
 from torch_surfcap.fitting.rays import RayBatch
 
-DEVICE = "made_up"
 ROWS = 4
 
 
@@ -50,16 +50,6 @@ class NoWaiting(TorchDispatchMode):
         if there and func.__name__.startswith("index") and any(x.dtype == torch.bool for x in there[1:]):
             raise RuntimeError(f"{func}: rows chosen by a mask")
         return out
-
-
-class Moment:
-    """An event that has always happened."""
-
-    def query(self) -> bool:
-        return True
-
-    def elapsed_time(self, other: Moment) -> float:
-        return 1.0
 
 
 def moved(value: Any) -> Any:

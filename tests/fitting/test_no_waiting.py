@@ -1,4 +1,5 @@
-"""On a device the host queues iterations and waits for none: shown on a made-up one, and on a GPU where there is one."""
+"""On a device all tensors are there, and the host queues iterations and waits for none: shown on made-up ones, and on a GPU
+where there is one."""
 
 from __future__ import annotations
 
@@ -24,13 +25,23 @@ CASES = (
 )
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_without_numbers(case: str) -> None:
-    """Every iteration can be queued without a number of the device's, and nothing of the host's is read there."""
-    command = [sys.executable, "-m", "tests.fitting.fake_device", *case.split()]
+def check(program: str, case: str) -> None:
+    command = [sys.executable, "-m", f"tests.fitting.{program}", *case.split()]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_without_numbers(case: str) -> None:
+    """Every iteration can be queued without a number of the device's, and nothing of the host's is read there."""
+    check("fake_device", case)
+
+
+@pytest.mark.parametrize("case", [CASES[3], CASES[4], "images=host plates=true sh_degree=0"])
+def test_a_whole_fit_there(case: str) -> None:
+    """No step of a fit brings tensors of two devices together; it is the CPU's, and it can be stopped and gone on with."""
+    check("made_up_device", case)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
