@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from tests.ops.fields import promises
-from torch_surfcap.field.tiles import MAX_SKIP, TileGrid, morton_sorted, voxel_centers, with_skips
+from torch_surfcap.field.tiles import (
+    MAX_SKIP,
+    TileGrid,
+    morton_sorted,
+    skips_by_doubling,
+    skips_on_host,
+    voxel_centers,
+    with_skips,
+)
 from torch_surfcap.ops import INSIDE, OUTSIDE
 
 
@@ -23,6 +32,23 @@ def test_skips_equal_the_slow_way() -> None:
     table = torch.where(kind > 0.99, 5, torch.where(kind > 0.98, INSIDE, OUTSIDE)).int()
     assert torch.equal(with_skips(table), promises(table))
     assert torch.equal(with_skips(with_skips(table)), promises(table))
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 8, 1), (40, 5, 60), (2, 300, 3), (130, 5, 40)])
+@pytest.mark.parametrize("share", [0.0, 1e-5, 1e-3, 0.1])
+def test_skips_by_doubling(shape: tuple[int, int, int], share: float, device: str) -> None:
+    """As scipy's, to the last cell, where one cell or none is marked and where many are."""
+    marked = torch.rand(shape, generator=torch.Generator().manual_seed(0)) < share
+    if share == 1e-5:
+        marked[shape[0] // 2, shape[1] // 3, shape[2] - 1] = True
+    found = skips_by_doubling(marked.to(device))
+    assert torch.equal(found.cpu().int(), skips_on_host(marked).int())
+
+
+def test_a_table_on_a_device(device: str) -> None:
+    g = torch.Generator().manual_seed(1)
+    table = torch.where(torch.rand(30, 20, 40, generator=g) > 0.999, 5, OUTSIDE).int()
+    assert torch.equal(with_skips(table.to(device)).cpu(), with_skips(table))
 
 
 def test_skips_of_nothing() -> None:

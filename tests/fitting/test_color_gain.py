@@ -89,7 +89,7 @@ def test_a_camera_that_sees_nothing_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("plates", [False, True])
-def test_a_ball_in_different_light(plates: bool) -> None:
+def test_a_ball_in_different_light(plates: bool, device: str) -> None:
     """Its cameras' gains come out of the fit; the mesh is as good as without them, and off leaves pictures alone."""
     true = ball(12, 48, plates)
     gains = torch.linspace(0.8, 1.2, 12).roll(5)
@@ -102,7 +102,7 @@ def test_a_ball_in_different_light(plates: bool) -> None:
         plates_in = [plate / gain for plate, gain in zip(true.plates, gains, strict=True)]
     capture = Capture(images, true.cameras.K, true.cameras.world_to_camera, true.masks, plates_in)
     capture.mask_source = true.mask_source
-    settings: dict[str, Any] = {"sh_degree": 0, "levels": 2, "voxel": 1 / 40}
+    settings: dict[str, Any] = {"sh_degree": 0, "levels": 2, "voxel": 1 / 40, "device": device}
     result = fit(capture, gains="on", **settings)
     assert result.chosen["gains"]["value"] == "on"
     error = (result.gain - (gains / gains.mean())[:, None]).abs()

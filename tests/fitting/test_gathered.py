@@ -30,23 +30,24 @@ def threads() -> Iterator[None]:
 
 
 def swollen_ball(
-    opacity: str, lattice: int = 32, views: int = 8
+    opacity: str, device: str, lattice: int = 32, views: int = 8
 ) -> tuple[GatheredGradient, dict[str, Any], Tensor]:
     """A ball half a voxel too large and too bright, as a fit may hold it, before its photographs; the step's arguments and
     the shifts of its cameras."""
     voxel = 0.024
-    given: dict[str, Any] = {"opacity": opacity, "gradient": "gather", "lattice": lattice}
+    given: dict[str, Any] = {"opacity": opacity, "gradient": "gather", "lattice": lattice, "device": device}
     if opacity == "distance":
         given["descent"] = {"last_step": DIAGONAL}
     stage, _, settings = begun(ball(views, 64), voxel, 1, **given)
     grid, store, rays = stage.grid, stage.store, stage.rays
-    points = voxel_centers(grid).float()
+    points = voxel_centers(grid).float().cpu()
     away = ((points - torch.tensor(CENTER)).norm(dim=-1) - RADIUS) / voxel - 0.5
-    store[..., 0] = away.clamp(-4, 4) if opacity == "distance" else (0.8 + 0.4 * away).clamp(0.01, 1.0)
-    store[..., 1:4] = (color_at(points.view(-1, 3)).view(*away.shape, 3) + 0.1).clamp(0, 1)
+    value = away.clamp(-4, 4) if opacity == "distance" else (0.8 + 0.4 * away).clamp(0.01, 1.0)
+    color = (color_at(points.view(-1, 3)).view(*away.shape, 3) + 0.1).clamp(0, 1)
+    store[..., 0], store[..., 1:4] = value.to(device), color.to(device)
     rays.find_ranges(store, grid, opacity, stage.march)
     gathered = GatheredGradient(rays, grid, settings, stage.march)
-    shift = torch.rand(views, generator=torch.Generator().manual_seed(0)) - 0.5
+    shift = torch.rand(views, generator=torch.Generator().manual_seed(0)).to(device) - 0.5
     loss = settings.losses
     arguments = {
         "voxels": store,
@@ -63,12 +64,12 @@ def swollen_ball(
 
 
 @pytest.mark.parametrize(("opacity", "least"), [("transparency", 0.98), ("distance", 0.93)])
-def test_angle_to_the_exact_gradient(opacity: str, least: float) -> None:
+def test_angle_to_the_exact_gradient(opacity: str, least: float, device: str) -> None:
     """As measured, from 24 views at 2.4 pixels to a voxel's face, a distance with steps of a voxel's diagonal: 0.986 and
     0.938 for the opacity value, 0.980 and 0.976 for colour. A distance's derivative changes its sign across the surface,
     within what a voxel reads. The sums over all voxels agree far better than that: the density of samples is the right
     factor."""
-    gathered, arguments, shift = swollen_ball(opacity, views=24)
+    gathered, arguments, shift = swollen_ball(opacity, device, views=24)
     losses, gradient, *_ = gathered.step(arguments, shift, Stopwatch({}))
     exact_losses, exact, *_ = ops.photometric_step(**arguments, ranges=gathered.rays.ranges)
     torch.testing.assert_close(losses, exact_losses)
@@ -83,10 +84,10 @@ def test_angle_to_the_exact_gradient(opacity: str, least: float) -> None:
 
 
 @pytest.mark.parametrize("opacity", OPACITIES)
-def test_eight_bits_cost_no_angle(opacity: str) -> None:
+def test_eight_bits_cost_no_angle(opacity: str, device: str) -> None:
     """Of a mean relative error of 1/20 per number, little is left in their sums; the scale uses the format's upper end."""
-    wide, arguments, shift = swollen_ball(opacity)
-    narrow, *_ = swollen_ball(opacity, lattice=8)
+    wide, arguments, shift = swollen_ball(opacity, device)
+    narrow, *_ = swollen_ball(opacity, device, lattice=8)
     _, exact, *_ = wide.step(arguments, shift, Stopwatch({}))
     _, coarse, *_ = narrow.step(arguments, shift, Stopwatch({}))
     assert 4 * narrow.slots.nbytes == wide.slots.nbytes
@@ -108,15 +109,15 @@ def test_rows_hold_every_shift() -> None:
 
 
 @pytest.mark.parametrize("opacity", OPACITIES)
-def test_rows_hold_every_sample(opacity: str) -> None:
+def test_rows_hold_every_sample(opacity: str, device: str) -> None:
     """Rows twice as wide take up nothing more."""
-    gathered, arguments, shift = swollen_ball(opacity)
+    gathered, arguments, shift = swollen_ball(opacity, device)
     _, gradient, *_ = gathered.step(arguments, shift, Stopwatch({}))
     narrow = gradient.clone()
     counts = gathered.starts.diff()
     gathered.first = gathered.first - 4
     gathered.starts = torch.cat([counts.new_zeros(1), (counts + 8).cumsum(0)])
-    gathered.slots = torch.empty(int(gathered.starts[-1]), 4)
+    gathered.slots = torch.empty(int(gathered.starts[-1]), 4, device=device)
     _, gradient, *_ = gathered.step(arguments, shift, Stopwatch({}))
     torch.testing.assert_close(gradient, narrow)
 

@@ -87,9 +87,9 @@ def score(result: FitResult, capture: Capture) -> float:
 
 @pytest.mark.parametrize("opacity", ["transparency", "distance"])
 @pytest.mark.parametrize("gradient", ["scatter", "gather"])
-def test_it_explains_what_depends_on_the_direction(opacity: str, gradient: str) -> None:
+def test_it_explains_what_depends_on_the_direction(opacity: str, gradient: str, device: str) -> None:
     capture = sheen(ball(12, 40))
-    given: dict[str, Any] = {"opacity": opacity, "gradient": gradient}
+    given: dict[str, Any] = {"opacity": opacity, "gradient": gradient, "device": device}
     plain = fitted(capture, sh_degree=0, **given)
     coarse = fitted(capture, sh_degree=1, view_spacing=4, **given)
     assert coarse.field.voxels.shape[-1] == 4
@@ -106,9 +106,9 @@ def test_a_dull_scene_stays_dull() -> None:
     assert not coarse.field.view.voxels[..., :4].any()
 
 
-def test_eight_bits_beside_it() -> None:
+def test_eight_bits_beside_it(device: str) -> None:
     capture = sheen(ball(12, 40))
-    wide, narrow = (fitted(capture, sh_degree=1, view_spacing=8, storage=b) for b in (32, 8))
+    wide, narrow = (fitted(capture, sh_degree=1, view_spacing=8, storage=b, device=device) for b in (32, 8))
     assert score(narrow, capture) > score(wide, capture) - 0.7
 
 

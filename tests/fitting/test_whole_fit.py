@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +12,9 @@ import torch
 import trimesh
 
 from tests.fitting.sphere import CENTER, RADIUS, ball
-from torch_surfcap import FitResult, InputError, fit
+from tests.fitting.stages import begun
+from torch_surfcap import Capture, FitResult, InputError, devices, fit
+from torch_surfcap.field.field import RayOutput
 from torch_surfcap.fitting import fit as fit_function
 from torch_surfcap.fitting.budget import estimate, shortage
 from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
@@ -33,9 +36,10 @@ def errors(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 @pytest.mark.parametrize("opacity", ["transparency", "distance"])
-def test_ball(opacity: str) -> None:
+def test_ball(opacity: str, device: str) -> None:
     """One closed piece, half a voxel from the truth on average or less, nowhere two; the colours explain the pictures."""
-    result = fit(ball(side=48), opacity=opacity, sh_degree=0, **QUICK)
+    result = fit(ball(side=48), opacity=opacity, sh_degree=0, device=device, **QUICK)
+    assert result.field.voxels.device.type == device
     voxel = result.chosen["voxel"]["value"]
     assert voxel == 1 / 40
     assert result.mesh.body_count == 1
@@ -46,7 +50,7 @@ def test_ball(opacity: str) -> None:
     capture = ball(side=48)
     backdrop = torch.zeros(48 * 48, 3)
     with torch.no_grad():
-        seen = result.field(*capture.cameras.rays(0), backdrop)
+        seen = RayOutput(*(x.cpu() for x in result.field(*capture.cameras.rays(0), backdrop)))
     assert capture.masks is not None
     mask = capture.masks[0].flatten()
     photograph = (capture.photograph(0).view(-1, 3) * mask[:, None]).clamp(0, 1)
@@ -63,8 +67,9 @@ def test_ball(opacity: str) -> None:
 
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("opacity", ["transparency", "distance"])
-def test_higher_degrees(opacity: str, degree: int) -> None:
-    result = fit(ball(side=48), opacity=opacity, sh_degree=degree, levels=1, voxel=1 / 24)
+def test_higher_degrees(opacity: str, degree: int, device: str) -> None:
+    given: dict[str, Any] = {"opacity": opacity, "sh_degree": degree, "device": device}
+    result = fit(ball(side=48), levels=1, voxel=1 / 24, **given)
     assert result.field.sh_degree == degree
     assert np.median(np.abs(errors(result.mesh))) < 1 / 24
     assert result.history[-1]["loss"] < 0.2 * result.history[0]["loss"]
@@ -72,17 +77,19 @@ def test_higher_degrees(opacity: str, degree: int) -> None:
 
 
 @pytest.mark.parametrize("visit", ["cells", "box"])
-def test_what_rays_visit_changes_next_to_nothing(visit: str) -> None:
+def test_what_rays_visit_changes_next_to_nothing(visit: str, device: str) -> None:
     """Without integration ranges, and even through the whole box, the same surface comes out."""
-    result = fit(ball(8, 32), sh_degree=0, levels=1, voxel=0.05, descent={"visit": visit})
-    usual = fit(ball(8, 32), sh_degree=0, levels=1, voxel=0.05)
+    result = fit(ball(8, 32), sh_degree=0, levels=1, voxel=0.05, descent={"visit": visit}, device=device)
+    usual = fit(ball(8, 32), sh_degree=0, levels=1, voxel=0.05, device=device)
     assert np.isnan(result.history[0]["samples"])
     assert usual.history[0]["samples"] > 0
     assert abs(np.abs(errors(result.mesh)).mean() - np.abs(errors(usual.mesh)).mean()) < 0.1 * 0.05
 
 
-def test_plates_are_the_background() -> None:
-    result = fit(ball(8, 32, plates=True), sh_degree=0, levels=1, voxel=0.05)
+@pytest.mark.parametrize("images", ["device", "host"])
+def test_plates_are_the_background(images: str, device: str) -> None:
+    capture = ball(8, 32, plates=True)
+    result = fit(capture, sh_degree=0, levels=1, voxel=0.05, images=images, device=device)
     assert np.abs(errors(result.mesh)).max() < 2 * 0.05
 
 
@@ -175,6 +182,75 @@ def test_a_level_without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.chosen["voxel"] == {"value": 0.1, "reason": "memory"}
     assert result.chosen["levels"] == {"value": 1, "reason": "memory"}
     assert np.abs(errors(result.mesh)).max() < 2 * 0.1
+
+
+@pytest.mark.parametrize("at", ["begin_stage", "descend", "next_stage"])
+def test_memory_that_runs_out(at: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a device, in the midst of a level: as if it had been known before."""
+    capture, whole = ball(6, 32), fit(ball(6, 32), sh_degree=0, levels=1, voxel=0.1)
+    monkeypatch.setattr(devices, "may_run_out", lambda _: True)
+    there = getattr(fit_function, at)
+
+    def no_memory_at(number: int) -> None:
+        calls: list[int] = []
+
+        def runs_out(*arguments: Any) -> Any:
+            calls.append(1)
+            if at == "descend" and len(calls) > number:
+
+                def rows() -> Iterator[dict[str, float]]:
+                    yield from itertools.islice(there(*arguments), 3)
+                    raise torch.OutOfMemoryError("CUDA out of memory")
+
+                return rows()
+            if at != "descend" and len(calls) > max(0, number - 1):
+                raise torch.OutOfMemoryError("CUDA out of memory")
+            return there(*arguments)
+
+        monkeypatch.setattr(fit_function, at, runs_out)
+
+    if at != "next_stage":
+        no_memory_at(0)
+        with pytest.raises(
+            InputError, match=r"memory: level 1 of 2 .* GiB that are free: .*sh_degree=0"
+        ) as caught:
+            fit(capture, sh_degree=0, levels=2, voxel=0.05)
+        assert "\n" not in str(caught.value)
+    if at != "begin_stage":
+        no_memory_at(1)
+        result = fit(capture, sh_degree=0, levels=2, voxel=0.05)
+        (warning,) = result.warnings
+        assert warning.startswith("level 2 of 2 (voxels of 0.05) needs more than the")
+        assert warning.endswith("the fit ends with the level before")
+        assert result.chosen["levels"] == {"value": 1, "reason": "memory"}
+        assert result.field.voxel_size == whole.field.voxel_size
+
+
+def test_where_photographs_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the device where they leave room for the largest level, or where they are wanted; the fit is the same."""
+    _, studio, _ = begun(ball(6, 32), 0.1, 1)
+    kept: list[str] = []
+
+    def on(capture: Capture, device: torch.device) -> Capture:
+        kept.append(str(device))
+        return capture
+
+    monkeypatch.setattr(Capture, "on", on)
+    size = sum(picture.nbytes for picture in studio.pictures)
+    for images, free, expected in (
+        ("auto", 1000 + 2 * size, ["cpu"]),
+        ("auto", 1000 + size, []),
+        ("auto", 0, []),
+        ("device", 0, ["cpu"]),
+        ("host", 1 << 40, []),
+    ):
+        kept.clear()
+        monkeypatch.setattr(devices, "free_bytes", lambda _, free=free: free)
+        studio.keep_pictures(images, [500, 1000])
+        assert kept == expected
+    monkeypatch.undo()
+    fits = [fit(ball(6, 32), levels=1, voxel=0.1, images=images) for images in ("device", "host")]
+    assert same(*fits)
 
 
 def test_settings_that_are_none() -> None:

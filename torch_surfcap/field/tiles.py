@@ -162,11 +162,11 @@ def with_skips(table: Tensor) -> Tensor:
     for axis in range(3):
         upper = cell.narrow(axis, 1, cell.shape[axis] - 1).clone()
         cell.narrow(axis, 0, cell.shape[axis] - 1).logical_or_(upper)
-    skips = _skips_on_host(cell) if table.device.type == "cpu" else skips_by_doubling(cell)
+    skips = skips_on_host(cell) if table.device.type == "cpu" else skips_by_doubling(cell)
     return torch.where(table > OUTSIDE, table, OUTSIDE - skips.int())
 
 
-def _skips_on_host(cell: Tensor) -> Tensor:
+def skips_on_host(cell: Tensor) -> Tensor:
     """What :func:`skips_by_doubling` gives, by scipy: on the CPU that takes a tenth of the time."""
     distance = np.full(cell.shape, MAX_SKIP, dtype=np.int32)
     if cell.any():
