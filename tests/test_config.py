@@ -54,6 +54,13 @@ def test_auto_is_none() -> None:
     assert config.load(None, ["voxel=2", "voxel=auto"]).voxel is None
     assert config.load(None, ["sh_degree=2"]).sh_degree == 2
     assert config.load(None, ["device=auto"]).device == "auto"
+    assert config.load(None, ["images=auto"]).images == "auto"
+
+
+@pytest.mark.parametrize("word", ["auto", "cpu", "cuda", "cuda:0", "cuda:12"])
+def test_devices(word: str) -> None:
+    """As words, whether they can be used here or not."""
+    assert config.load(None, [f"device={word}"]).device == word
 
 
 def test_saved_config_loads_again(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import trimesh
 
 import torch_surfcap as sc
 from torch_surfcap import config as settings
+from torch_surfcap import devices
 from torch_surfcap.data.sample_scene import make_sample_scene
 from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.fitting.fit import Progress
@@ -111,7 +112,7 @@ def test_history_has_a_row_per_iteration(finished: Path) -> None:
 def test_metrics(finished: Path) -> None:
     metrics = json.loads((finished / "metrics.json").read_text())
     assert list(metrics) == [
-        *("train", "test", "seconds", "peak_memory_bytes", "voxels", "tiles", "triangles"),
+        *("train", "test", "seconds", "peak_memory_bytes", "device", "voxels", "tiles", "triangles"),
         *("chosen", "warnings", "resumed_from", "iterations_run"),
     ]
     for split, views in (("train", 8), ("test", TEST_VIEWS)):
@@ -126,6 +127,11 @@ def test_metrics(finished: Path) -> None:
     stages = [value for name, value in seconds.items() if name not in ("total", "levels")]
     assert sum(stages) == pytest.approx(seconds["total"], rel=0.05)
     assert 50e6 < metrics["peak_memory_bytes"] < 8e9
+    device = devices.resolve("auto")
+    assert metrics["device"]["word"] == str(device)
+    assert metrics["device"]["name"] == devices.name(device)
+    assert metrics["device"]["torch"] == torch.__version__
+    assert (metrics["device"]["peak_memory_bytes"] is None) == (device.type == "cpu")
     assert metrics["voxels"] == 64 * metrics["tiles"]
     mesh = trimesh.load(finished / "mesh.ply", force="mesh", process=False)
     assert isinstance(mesh, trimesh.Trimesh)
@@ -208,7 +214,7 @@ def test_resume_without_a_checkpoint_starts_afresh(
         ("losses.maks=1", "unknown key losses.maks, nearest known key: losses.mask"),
         ("sh_degree=4", "sh_degree is 4, expected one of 0, 1, 2"),
         ("mesh.threshold=9", "mesh.threshold is 9, expected more than -4 and less than 4"),
-        ("device=cuda", "device: found cuda, expected cpu"),
+        ("device=cuda:99", "device: found cuda:99, expected c"),
         ("cameras.skip=[nobody]", "no camera nobody among"),
         ("data.format=idr", "no calibration found"),
         ("data.box=[5,5,5,6,6,6]", "the visual hull is empty inside the box"),

@@ -59,6 +59,12 @@ class Row:
     key: str | None = None
     error: str = ""
 
+    @property
+    def device(self) -> str:
+        """Where its fit runs, as its arguments say."""
+        given = [word.partition("=")[2] for word in self.arguments if word.startswith("device=")]
+        return given[-1] if given else "auto"
+
 
 def read_table(path: Path) -> Table:
     """The file's rows. Raises InputError naming the file and what is wrong in it."""

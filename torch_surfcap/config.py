@@ -12,12 +12,14 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
+from re import Pattern
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from torch_surfcap import devices
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.data.readers import FORMATS
 from torch_surfcap.errors import InputError
@@ -35,6 +37,11 @@ from torch_surfcap.fitting.settings import (
 def _one_of(default: Any, *values: Any) -> Any:
     """A field that takes one of these values (or auto, where the default is None)."""
     return field(default=default, metadata={"values": values})
+
+
+def _like(default: Any, pattern: Pattern[str], words: str) -> Any:
+    """A field that takes a word of this pattern, such as these."""
+    return field(default=default, metadata={"pattern": (pattern, words)})
 
 
 def _within(default: Any, low: float, high: float = float("inf")) -> Any:
@@ -105,7 +112,8 @@ class MeshConfig:
 class Config:
     data: DataConfig = field(default_factory=DataConfig)
     out: str = "out"  # folder of the results
-    device: str = _one_of("auto", "auto", "cpu", "cuda")
+    device: str = _like("auto", devices.WORD, devices.WORDS)  # auto: a GPU where one can be used
+    images: str = _one_of("auto", *CHOICES["images"])  # where they are kept; auto: on the device if they fit
     seed: int = _within(0, 0)
     sh_degree: int | None = _one_of(None, 0, 1, 2)  # of the colour's dependence on the direction of view
     view_spacing: int = _one_of(1, *VIEW_SPACINGS)  # voxels between the nodes of view-dependent coefficients
@@ -195,6 +203,7 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "upscale": config.upscale,
         "box": None if config.data.box is None else tuple(config.data.box),
         "seed": config.seed,
+        "images": config.images,
         "gradient": config.gradient,
         "lattice": config.lattice,
         "storage": config.storage,
@@ -339,6 +348,9 @@ def _check(config: Any, source: str, prefix: str = "") -> None:
         if values and value not in values:
             choices = ", ".join(map(str, values))
             raise InputError(f"{source}: {key} is {value!r}, expected one of {choices}")
+        pattern, words = entry.metadata.get("pattern", (None, ""))
+        if pattern and not pattern.fullmatch(value):
+            raise InputError(f"{source}: {key} is {value!r}, expected one of {words}")
         if limits and not limits[0] <= value <= limits[1]:
             expected = f"a number from {limits[0]} to {limits[1]}"
             raise InputError(f"{source}: {key} is {value!r}, expected {expected}")
@@ -351,4 +363,4 @@ def _check(config: Any, source: str, prefix: str = "") -> None:
 
 # Fields in which "auto" is a word like any other.
 _SAYS_ON = {"gains", "floor"}  # and on and off, which YAML takes for true and false
-_SAYS_AUTO = {"data.format", "device", "gains", "floor"}
+_SAYS_AUTO = {"data.format", "device", "images", "gains", "floor"}

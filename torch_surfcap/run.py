@@ -7,6 +7,7 @@ from pathlib import Path
 import trimesh
 
 from torch_surfcap import config as settings
+from torch_surfcap import devices
 from torch_surfcap.data.geometry import read_mesh
 from torch_surfcap.data.parse import read_json
 from torch_surfcap.errors import InputError
@@ -22,11 +23,15 @@ def check_run(run: Path) -> None:
             raise InputError(f"{run / name}: not there, expected the folder of a finished fit")
 
 
-def read_run(run: Path) -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]:
-    """Config, field and mesh of a finished run. Raises InputError naming the file that is missing or damaged."""
+def read_run(run: Path, device: str = "cpu") -> tuple[settings.Config, SurfaceField, trimesh.Trimesh]:
+    """Config, field and mesh of a finished run, the field on a device (auto, cpu, cuda, cuda:0, ...).
+
+    Raises InputError naming the file that is missing or damaged, or the device that cannot be used.
+    """
+    there = devices.resolve(device)
     check_run(run)
     config = settings.load(run / "config.yaml")
-    return config, SurfaceField.load(run / "field.npz"), read_mesh(run / "mesh.ply")
+    return config, SurfaceField.load(run / "field.npz").to(there), read_mesh(run / "mesh.ply")
 
 
 def gains_fitted(run: Path) -> bool:

@@ -104,7 +104,12 @@ def run_row(row: Row, capture: Path, out: Path) -> dict[str, Any]:
     truths = [(flag, str(capture / name)) for flag, name in TRUTHS.items() if (capture / name).is_file()]
     commands = (
         ["fit.py", *row.arguments, f"out={folder}"],
-        ["evaluate.py", f"--run={folder}", *(f"{flag}={path}" for flag, path in truths)],
+        [
+            "evaluate.py",
+            f"--run={folder}",
+            f"--device={row.device}",
+            *(f"{flag}={path}" for flag, path in truths),
+        ],
     )
     # On Linux a child's peak memory begins at its parent's: this process loads nothing that a fit does not.
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "PYTHONUNBUFFERED": "1"}
@@ -285,8 +290,11 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--minutes", type=float, default=60.0, help="start no row that would end later")
     parser.add_argument("--page", type=Path, metavar="MD", help="write the page there instead of into OUT")
+    parser.add_argument("--device", metavar="DEVICE", help="of every row: auto, cpu, cuda, cuda:0, ...")
     parser.add_argument("settings", nargs="*", metavar="key=value", help="of every row")
-    return parser.parse_intermixed_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
+    options.settings += [f"device={options.device}"] * bool(options.device)
+    return options
 
 
 if __name__ == "__main__":

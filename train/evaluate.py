@@ -29,7 +29,7 @@ from typing import Any
 import trimesh
 
 from torch_surfcap import config as settings
-from torch_surfcap import report
+from torch_surfcap import devices, report
 from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.data.geometry import Points, read_mesh, read_points
 from torch_surfcap.data.parse import read_json
@@ -83,6 +83,7 @@ def _check(options: argparse.Namespace, runs: list[Path]) -> None:
         raise InputError(f"{protocol}: --dtu-truth, --scan or --cull is given, expected --protocol dtu")
     if options.table is not None and Path(options.table).suffix != ".md":
         raise InputError(f"--table {options.table}: expected a name in .md, the same in .json goes beside it")
+    devices.resolve(options.device)
     for run in runs:
         check_run(run)
 
@@ -90,7 +91,7 @@ def _check(options: argparse.Namespace, runs: list[Path]) -> None:
 def _score(run: Path, scan: dtu.Scan | None, options: argparse.Namespace) -> dict[str, Any]:
     """The results of one run, as evaluation.json gets them."""
     start = time.perf_counter()
-    config, field, mesh = read_run(run)
+    config, field, mesh = read_run(run, options.device)
     capture = _capture(config, options.protocol)
     truth = None if options.mesh_truth is None else read_mesh(Path(options.mesh_truth))
     points = None if options.points_truth is None else read_points(Path(options.points_truth))
@@ -209,6 +210,9 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--table", metavar="FILE.md", help="write the table of the runs and their mean, as FILE.json too"
+    )
+    parser.add_argument(
+        "--device", default="auto", metavar="DEVICE", help="of the field: auto, cpu, cuda, cuda:0, ..."
     )
     parser.add_argument("--dtu-truth", metavar="FOLDER", help="with DTU's Points/stl and ObsMask")
     parser.add_argument(

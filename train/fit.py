@@ -32,11 +32,11 @@ import torch
 from tqdm import tqdm
 
 from torch_surfcap import config as settings
-from torch_surfcap import report
+from torch_surfcap import devices, report
 from torch_surfcap.config import Config
 from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.errors import InputError
-from torch_surfcap.fitting.checkpoint import Checkpoints
+from torch_surfcap.fitting.checkpoint import FREE, Checkpoints
 from torch_surfcap.fitting.fit import FitResult, Progress, fit
 
 RESULTS = ("mesh.ply", "mesh.glb", "field.npz", "config.yaml", "preview.png", "history.csv", "metrics.json")
@@ -47,7 +47,7 @@ EVALUATED = (
 )  # by evaluate.py; they, and the pictures of render.py, go with the results they are of
 CHECKPOINT = "checkpoint.npz"
 # May differ between a run and its resumption.
-FREE_KEYS = {"out", "device", "overwrite", "resume", "checkpoint"}
+FREE_KEYS = {"out", "overwrite", "resume", "checkpoint", *FREE}
 SHOWN = {"psnr_volume": "PSNR volume", "psnr_raster": "PSNR raster", "psnr_masked": "PSNR masked"}
 
 
@@ -79,18 +79,19 @@ def run(config: Config, started: float = 0.0) -> None:
     out = Path(config.out)
     if not config.data.path:
         raise InputError("data.path is not given, expected data.path=FOLDER of a capture")
+    device = devices.resolve(config.device)
     _check_out(out, config)
+    devices.reset_peak(device)
     capture = _load(config)
     seconds: dict[str, Any] = {"total": 0.0, "start": started, "load": time.perf_counter() - start}
-    with closing(Bars()) as bars:
-        device = "cpu" if config.device == "auto" else config.device
+    with closing(Bars(device)) as bars:
         label = settings.to_yaml(config)
         checkpoints = Checkpoints(out / CHECKPOINT, config.checkpoint, config.resume, label)
-        result = fit(capture, bars, checkpoints, device=device, **settings.fit_arguments(config))
+        result = fit(capture, bars, checkpoints, device=str(device), **settings.fit_arguments(config))
     for warning in result.warnings[len(capture.warnings) :]:
         print(f"warning: {warning}")
     seconds |= result.seconds
-    metrics = _metrics(result, capture, seconds)
+    metrics = _metrics(result, capture, seconds, device)
     _write(out, config, result, capture, metrics, start - started)
     _summary(metrics, out)
 
@@ -98,7 +99,8 @@ def run(config: Config, started: float = 0.0) -> None:
 class Bars:
     """The estimate before the first level, then a progress bar per level."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device = devices.CPU) -> None:
+        self.device = device
         self.bar: tqdm[Any] | None = None
         self.number = -1
 
@@ -107,7 +109,9 @@ class Bars:
             memory = max(at.budget.level_bytes) / 2**30
             levels = f"{at.levels} level" + "s" * (at.levels > 1)
             threads = f"{torch.get_num_threads()} thread" + "s" * (torch.get_num_threads() > 1)
-            print(f"{levels}, about {at.budget.seconds:.0f} s on {threads}, {memory:.1f} GiB", flush=True)
+            where, seconds = devices.name(self.device), at.budget.seconds
+            cost = where if seconds is None else f"about {seconds:.0f} s on {threads}"
+            print(f"{levels}, {cost}, {memory:.1f} GiB", flush=True)
             return
         if at.number != self.number or self.bar is None:
             self.close()
@@ -178,7 +182,9 @@ def _load(config: Config) -> Capture:
     return capture
 
 
-def _metrics(result: FitResult, capture: Capture, seconds: dict[str, Any]) -> dict[str, Any]:
+def _metrics(
+    result: FitResult, capture: Capture, seconds: dict[str, Any], device: torch.device
+) -> dict[str, Any]:
     """The content of metrics.json, but for the seconds that writing takes. Scores at most 8 views of either kind."""
     begin = time.perf_counter()
     scores: dict[str, Any] = {"train": None, "test": None}
@@ -191,6 +197,12 @@ def _metrics(result: FitResult, capture: Capture, seconds: dict[str, Any]) -> di
         **scores,
         "seconds": seconds,
         "peak_memory_bytes": 0,
+        "device": {
+            "word": str(device),
+            "name": devices.name(device),
+            "torch": torch.__version__,
+            "peak_memory_bytes": devices.peak_bytes(device),
+        },
         "voxels": result.field.voxels[..., 0].numel(),
         "tiles": len(result.field.voxels),
         "triangles": len(result.mesh.faces),
@@ -247,7 +259,11 @@ def _summary(metrics: dict[str, Any], out: Path) -> None:
     stages = [f"{name} {value:.1f}" for name, value in seconds.items() if name not in ("total", "levels")]
     print(f"triangles      {metrics['triangles']}")
     print(f"seconds        {seconds['total']:.1f} ({', '.join(stages)})")
+    device = metrics["device"]
     print(f"memory         {metrics['peak_memory_bytes'] / 2**30:.2f} GiB")
+    there = device["peak_memory_bytes"]
+    peak = "" if there is None else f", at most {there / 2**30:.2f} GiB of its memory"
+    print(f"device         {device['name']}{peak}")
     print(f"files          {out}: {', '.join(RESULTS)}")
 
 

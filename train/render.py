@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def render(options: argparse.Namespace) -> list[Path]:
     """Write the pictures that the options name, and return their files."""
     run = Path(options.run)
-    config, field, mesh = read_run(run)
+    config, field, mesh = read_run(run, options.device)
     kinds = _kinds(options, max(field.sh_degree, field.view.sh_degree if field.view else 0))
     _check_numbers(options)
     (axis, position), poses = _section(options.section, mesh), _poses(config)
@@ -293,6 +293,9 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--section", metavar="AXIS[=POSITION]", help="plane to cut, world units, such as y=0.1"
+    )
+    parser.add_argument(
+        "--device", default="auto", metavar="DEVICE", help="of the field: auto, cpu, cuda, cuda:0, ..."
     )
     parser.add_argument("--mesh-truth", metavar="MESH", help="true surface, for the kind error")
     parser.add_argument("--cut", type=float, default=0.05, help="longest distance that counts, world units")

@@ -79,12 +79,10 @@ def cast(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Hits:
     width, height = (int(s) for s in cameras.size[i])
     box = np.zeros((2, 3)) if len(mesh.faces) == 0 else np.array(mesh.bounds)
     pixels = window(cameras, i, *torch.from_numpy(box))
-    origins, directions = (x.numpy() for x in pixel_rays(cameras, i, pixels))
-    face = np.full(len(pixels), -1)
-    if len(mesh.faces) and len(pixels):
-        face = np.asarray(mesh.ray.intersects_first(origins, directions), dtype=np.int64)
+    face = first_faces(mesh, cameras, i, pixels)
     hit = np.flatnonzero(face >= 0)
-    face, origins, directions = face[hit], origins[hit], directions[hit]
+    face, pixels = face[hit], pixels[torch.from_numpy(hit)]
+    origins, directions = (x.numpy() for x in pixel_rays(cameras, i, pixels))
     offset = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)[face]] - origins[:, None]
     normal = np.cross(offset[:, 1] - offset[:, 0], offset[:, 2] - offset[:, 0])
     slope = row_dot(normal, directions)
@@ -93,7 +91,15 @@ def cast(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Hits:
     along = np.einsum("ijk,ik->ij", offset, directions)
     distance = np.clip(distance, along.min(axis=1, initial=np.inf), along.max(axis=1, initial=-np.inf))
     point = origins + distance[:, None] * directions
-    return Hits((height, width), pixels.numpy()[hit], face, point, directions, distance)
+    return Hits((height, width), pixels.numpy(), face, point, directions, distance)
+
+
+def first_faces(mesh: trimesh.Trimesh, cameras: Cameras, i: int, pixels: Tensor) -> NDArray[np.int64]:
+    """[M] the face that the ray through each of the pixels numbered [M] meets first, -1 where there is none."""
+    if len(mesh.faces) == 0 or len(pixels) == 0:
+        return np.full(len(pixels), -1)
+    origins, directions = (x.numpy() for x in pixel_rays(cameras, i, pixels))
+    return np.asarray(mesh.ray.intersects_first(origins, directions), dtype=np.int64)
 
 
 def raster(
