@@ -88,6 +88,33 @@ def test_the_same_bits_after_any_iteration(settings: dict[str, Any], moment: int
     assert resumed.resumed_from == [int(whole.history[moment]["level"]), len(before)]
 
 
+def test_a_checkpoint_of_another_device(tmp_path: Path) -> None:
+    """Its random numbers cannot go on here: others begin, the same whenever this is done, and the fit ends as well."""
+    capture, path = ball(8, 32), tmp_path / "checkpoint.npz"
+    whole = fit(capture, **QUICK)
+
+    def stop(at: Progress) -> None:
+        if at.number == 1:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(capture, stop, Checkpoints(path, seconds=0), **QUICK)
+    with np.load(path) as data:
+        arrays = dict(data)
+    plain = json.loads(arrays["plain"].tobytes())
+    plain["settings"]["device"] = "cuda:1"
+    plain["waiting"] = [whole.history[0]]  # of an iteration whose loss came too late for the checkpoint
+    text = np.frombuffer(json.dumps(plain).encode(), dtype=np.uint8)
+    np.savez(path, **{**arrays, "plain": text, "generator": np.zeros(16, dtype=np.uint8)})
+    one, two = (fit(capture, None, Checkpoints(path, resume=True), **QUICK, images="host") for _ in range(2))
+    assert one.history == two.history
+    first = next(i for i, row in enumerate(whole.history) if row["level"] == 1)
+    assert one.history[:first] == whole.history[:first]
+    assert {**one.history[first], "level": 0.0} == whole.history[0]
+    assert one.history[first + 1]["loss"] != whole.history[first]["loss"]
+    assert one.history[-1]["loss"] < 1.2 * whole.history[-1]["loss"]
+
+
 def test_checkpoints_of_something_else(tmp_path: Path) -> None:
     capture, path = ball(6, 32), tmp_path / "checkpoint.npz"
     fit(capture, None, Checkpoints(path, seconds=0), **QUICK)
