@@ -245,3 +245,23 @@ def test_padding_is_used_where_no_gradient_is_asked() -> None:
     with torch.no_grad():
         assert field._store().data_ptr() == field.voxels.data_ptr()
         assert field._store().shape[-1] == ops.pitch(1)
+
+
+@BOTH
+def test_a_field_that_moves(opacity: str, device: str) -> None:
+    """There it sees the same, in memory that is padded as before; what stays where it is, is not copied."""
+    view = random_field(1, "distance", torch.float32)
+    field = random_field(1, opacity, torch.float32)
+    field = SurfaceField(field.voxels.detach(), field.grid, opacity, view=view)
+    rays = [r.float() for r in some_rays(field, 100)]
+    with torch.no_grad():
+        here = field(*rays)
+        place = field.voxels.data_ptr()
+        moved = field.to(device).double().float()
+        there = moved(*rays)
+        assert moved._store().data_ptr() == moved.voxels.data_ptr() != place
+    assert there.color.device.type == device
+    for one, two in zip(here, there, strict=True):
+        torch.testing.assert_close(two.cpu(), one, equal_nan=True)
+    place = moved.voxels.data_ptr()
+    assert moved.to(device).voxels.data_ptr() == place

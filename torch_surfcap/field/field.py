@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -81,9 +81,7 @@ class SurfaceField(nn.Module):
             raise ValueError(f"voxels: expected {[*expected, '*']}, got {list(voxels.shape)}")
         grid.check()
         self.sh_degree = ops.degree_of(voxels.shape[-1])
-        # The memory behind the parameter is padded to a record's pitch, so that no op has to copy it.
-        store = ops.padded(voxels.detach()).contiguous()
-        self.voxels = nn.Parameter(store[..., : ops.coefficients(self.sh_degree)])
+        self.voxels = nn.Parameter(self._padded(voxels.detach()))
         self.opacity = opacity
         self.voxel_size = grid.voxel_size
         self.outside, self.inside = MISSING[opacity]
@@ -218,10 +216,28 @@ class SurfaceField(nn.Module):
             color = color + self.view.sample(points, directions)[1]
         return opacity, color
 
+    def _padded(self, voxels: Tensor) -> Tensor:
+        """The coefficients in memory that is padded to a record's pitch, so that no op has to copy them."""
+        return ops.padded(voxels).contiguous()[..., : ops.coefficients(self.sh_degree)]
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SurfaceField:
+        """What ``to`` and its like do: their copies of the parameter are padded again."""
+
+        def moved(tensor: Tensor) -> Any:
+            copy = fn(tensor)
+            return self._padded(copy) if tensor is self.voxels and copy.stride() != self._strides() else copy
+
+        super()._apply(moved, recurse)
+        return self
+
+    def _strides(self) -> tuple[int, ...]:
+        """Those of padded memory."""
+        width = ops.pitch(self.sh_degree)
+        return 64 * width, 16 * width, 4 * width, width, 1
+
     def _store(self) -> Tensor:
         """The parameter as the ops want it: padded records. The memory behind it, where that still is padded."""
-        voxels, width = self.voxels, ops.pitch(self.sh_degree)
-        strides = (64 * width, 16 * width, 4 * width, width, 1)
+        voxels, width, strides = self.voxels, ops.pitch(self.sh_degree), self._strides()
         differentiable = voxels.requires_grad and torch.is_grad_enabled()
         if voxels.shape[-1] < width and voxels.stride() == strides and not differentiable:
             return voxels.detach().as_strided((*voxels.shape[:4], width), strides)

@@ -180,7 +180,7 @@ def skips_by_doubling(cell: Tensor) -> Tensor:
     Of min(d, 2 R), what is less than R is min(d, R); where that is R, walking R cells towards the nearest marked one leaves
     d - R, and no walk leaves less: the rest is the least min(d, R) within R cells.
     """
-    distance = torch.where(cell, 0, 1).to(torch.uint8)
+    distance = cell.logical_not().to(torch.uint8)
     reach = 1
     while reach < MAX_SKIP:
         rest = distance
