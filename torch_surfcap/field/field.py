@@ -93,9 +93,8 @@ class SurfaceField(nn.Module):
         self.origin: Tensor
         self.register_buffer("table", grid.table.to(voxels.device), persistent=False)
         self.register_buffer("tile_coords", grid.coords.to(voxels.device), persistent=False)
-        self.register_buffer(
-            "origin", torch.tensor(grid.origin, dtype=torch.float64, device=voxels.device), persistent=False
-        )
+        corner = torch.tensor(grid.origin, dtype=torch.float64, device=voxels.device)
+        self.register_buffer("origin", corner, persistent=False)
         self._corner = grid.origin  # the buffer takes the module's precision, this one stays exact
         self._frame = grid.frame(self.outside, self.inside)
 
@@ -220,15 +219,14 @@ class SurfaceField(nn.Module):
         """The coefficients in memory that is padded to a record's pitch, so that no op has to copy them."""
         return ops.padded(voxels).contiguous()[..., : ops.coefficients(self.sh_degree)]
 
-    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> SurfaceField:
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Any:
         """What ``to`` and its like do: their copies of the parameter are padded again."""
 
         def moved(tensor: Tensor) -> Any:
             copy = fn(tensor)
             return self._padded(copy) if tensor is self.voxels and copy.stride() != self._strides() else copy
 
-        super()._apply(moved, recurse)
-        return self
+        return super()._apply(moved, recurse)
 
     def _strides(self) -> tuple[int, ...]:
         """Those of padded memory."""
@@ -272,7 +270,7 @@ class SurfaceField(nn.Module):
             "opacity": np.str_(self.opacity),
             "step": np.float64(self.step),
         }
-        view = {} if self.view is None else self.view._arrays()
+        view = self.view._arrays() if self.view else {}
         return data | {VIEW_PREFIX + name: value for name, value in view.items()}
 
     @classmethod
