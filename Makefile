@@ -1,4 +1,4 @@
-# make setup | fit | test | check | format | bench
+# make setup | fit | test | check | cuda-check | format | bench
 # PYTHON chooses the interpreter; its own torch >= 2.10 is used if it has one, else TORCH is installed.
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
@@ -28,7 +28,7 @@ if sys.prefix != sys.base_prefix:
 endef
 export SHOW_PARENT
 
-.PHONY: setup fit test check format bench
+.PHONY: setup fit test check cuda-check format bench
 .DELETE_ON_ERROR:
 
 setup: $(STAMP) $(LIBRARY)
@@ -61,6 +61,12 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m mypy
 	$(if $(CXX_FILES),$(BIN)/clang-format --dry-run -Werror $(CXX_FILES))
+
+# Compiles CUDA's kernels, for one architecture and without a GPU, and says what they take.
+cuda-check: setup
+	TORCH_SURFCAP_CUDA=alone TORCH_CUDA_ARCH_LIST=9.0 NVCC_APPEND_FLAGS=-Xptxas=-v \
+	  $(BIN)/python setup.py -q build_ext --force --build-lib build/cuda > build/cuda.log
+	@$(BIN)/python tests/kernel_resources.py < build/cuda.log
 
 format: setup
 	$(BIN)/ruff check --fix-only .

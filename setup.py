@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import subprocess
 import sysconfig
 from concurrent.futures import ThreadPoolExecutor
 from glob import glob
@@ -9,18 +10,14 @@ from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
+from setuptools.errors import CompileError
 
 # Switches, all from the environment.
 # TORCH_SURFCAP_CUDA: 0, or 1; unset: if there are nvcc and a torch with CUDA. For tests: "alone", without the CPU's
 # kernels, and "emulated", CUDA's kernels compiled for the CPU.
 CUDA = os.environ.get("TORCH_SURFCAP_CUDA")
 DEBUG = os.environ.get("DEBUG") == "1"  # unoptimised, with symbols and assertions
-ARCHS = (
-    os.environ.get("TORCH_CUDA_ARCH_LIST", "7.5;8.0;8.6;8.9;9.0+PTX")
-    .replace(".", "")
-    .replace(" ", ";")
-    .split(";")
-)
+ARCHS = os.environ.get("TORCH_CUDA_ARCH_LIST", "7.5;8.0;8.6;8.9;9.0+PTX")
 JOBS = int(os.environ.get("MAX_JOBS", os.cpu_count() or 1))  # files compiled at the same time
 
 CC, CXX = os.environ.get("CC", "cc"), os.environ.get("CXX", "c++")
@@ -34,12 +31,17 @@ EMULATION = ["-DSURFCAP_CUDA_EMULATION", "-Itests/emulation"]
 
 
 def gencode(arch: str) -> str:
-    """nvcc's option for 90 or, with PTX for what comes later, 90+PTX."""
-    n = arch.removesuffix("+PTX")
-    return f"-gencode=arch=compute_{n},code=[sm_{n}{f',compute_{n}' if n != arch else ''}]"
+    """nvcc's option for 9.0 or, with PTX for what comes later, 9.0+PTX."""
+    n = arch.removesuffix("+PTX").replace(".", "")
+    return f"-gencode=arch=compute_{n},code=[sm_{n}{f',compute_{n}' if '+PTX' in arch else ''}]"
 
 
-GPU = ["-DUSE_CUDA", "--expt-relaxed-constexpr", "-diag-suppress=128", *map(gencode, ARCHS)]
+GPU = [
+    "-DUSE_CUDA",
+    "--expt-relaxed-constexpr",
+    "-diag-suppress=128",
+    *map(gencode, ARCHS.replace(" ", ";").split(";")),
+]
 
 
 class BuildOps(build_ext):
@@ -65,10 +67,13 @@ class BuildOps(build_ext):
             target, listing = (Path("build/objects", key, source + suffix) for suffix in (".o", ".d"))
             os.makedirs(target.parent, exist_ok=True)
             needs = listing.read_text().replace("\\\n", "").split()[1:] if target.exists() else [""]
-            if self.force or any(
-                not os.path.exists(n) or os.path.getmtime(n) > target.stat().st_mtime for n in needs
-            ):
-                self.spawn([*tool, *common, "-MMD", "-MF", str(listing), "-c", source, "-o", str(target)])
+            made = target.stat().st_mtime if target.exists() else 0.0
+            if self.force or any(not os.path.exists(n) or os.path.getmtime(n) > made for n in needs):
+                command = [*tool, *common, "-MMD", "-MF", str(listing), "-c", source, "-o", str(target)]
+                done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+                print(*command, f"\n{done.stdout}", end="", flush=True)  # at once: other files are under way
+                if done.returncode:
+                    raise CompileError(f"{source} does not compile")
             return str(target)
 
         with ThreadPoolExecutor(JOBS) as pool:

@@ -73,7 +73,8 @@ class Subject:
         """
         fine = cameras.subset([i])
         fine = fine.resized(torch.full((1, 2), float(samples)), fine.size * samples)
-        hits = None if all(kind.endswith("volume") for kind in kinds) else cast(self.mesh, fine, 0)
+        device = self.field.voxels.device
+        hits = None if all(kind.endswith("volume") for kind in kinds) else cast(self.mesh, fine, 0, device)
         shown: dict[str, Tensor] = {}
         for kind in kinds:
             match kind:

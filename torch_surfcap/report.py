@@ -78,7 +78,7 @@ def rendered(
     photograph (which is all that a held-out camera's exposure can be known by) and given to the pictures.
     """
     behind = scene_background(capture, i, background)
-    hits = cast(mesh, capture.cameras, i)
+    hits = cast(mesh, capture.cameras, i, field.voxels.device)
     color, through = light(field, capture.cameras, i)
     onto = raster(field, mesh, capture.cameras, i, behind, hits)
     if gains:

@@ -14,7 +14,8 @@ Tensor visibility(Tensor voxels, Tensor table, std::vector<double> frame, Tensor
     const FieldArgument<Real, typename Types::Stored> field(voxels, table, frame);
     const RaysArgument<Real> rays(origins, directions, shift, origins);  // no background is read
     const RaySettings<Real> settings = ray_settings<Real>(opacity, slope, step, stop);
-    const Tensor seen = torch::stable::new_empty(origins, {field.view.tiles, kTileSide, kTileSide, kTileSide, 2});
+    const int64_t tiles = field.view.tiles;
+    const Tensor seen = torch::stable::new_empty(origins, {tiles, kTileSide, kTileSide, kTileSide, 2});
     device.visibility(field.view, rays.view, settings, groups, seen);
     return seen;
   });

@@ -13,6 +13,7 @@ from torch_surfcap.surface.render import (
     GREY,
     cast,
     constant_part,
+    first_faces,
     mesh_depth,
     mesh_mask,
     mesh_normals,
@@ -21,6 +22,7 @@ from torch_surfcap.surface.render import (
     view_dependent_part,
     volume,
     window,
+    z_buffer,
 )
 
 WIDTH, HEIGHT, AWAY = 60, 48, 2.0
@@ -180,3 +182,15 @@ def test_window_leaves_out_no_hit(mesh: trimesh.Trimesh, cameras: Cameras, i: in
     origins, directions = cameras.rays(i)
     face = mesh.ray.intersects_first(origins.numpy(), directions.numpy())
     assert (cast(mesh, cameras, i).pixel == np.flatnonzero(face >= 0)).all()
+
+
+@pytest.mark.parametrize("i", [0, 1])
+def test_the_z_buffer_sees_what_rays_meet(
+    mesh: trimesh.Trimesh, cameras: Cameras, i: int, device: str
+) -> None:
+    pixels = torch.arange(WIDTH * HEIGHT)
+    met = first_faces(mesh, cameras, i, pixels, torch.device("cpu"))
+    seen = z_buffer(mesh, cameras, i, torch.device(device)).flatten().numpy()
+    # A centre on the side of two faces is either's, and within rounding of the outline anybody's.
+    assert ((met >= 0) != (seen >= 0)).mean() < 0.001
+    assert (met != seen).mean() < 0.01

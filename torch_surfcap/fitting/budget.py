@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 GROUP_BYTES = 256 << 20  # for partial gradients; their number follows from the size of the problem alone
 GROUPS = (4, 32)  # fewest, most
+TRACE_BYTES = 1 << 30  # at most, on a GPU: samples of the rays in flight, csrc/cuda/walk.cuh
 CODE_GROUPS = 2  # the same beside codes, whose reason is to save memory
 BYTES_PER_RAY = 200  # rays, observations, ranges and results, and the copies while they are collected
 VIEW_BYTES_PER_RAY = 100  # what a ray reads there, where, and the photograph without it
@@ -47,32 +48,35 @@ def estimate(
     """The budget of a fit whose first level has this grid: surfaces grow by 4 per level, and so do pictures."""
     assert capture.masks is not None
     pixels = sum(float(mask.sum()) for mask in capture.masks)
-    pitch = store.shape[-1]
+    pitch, device = store.shape[-1], store.device
     area = _surface_tiles(grid, store[..., 0] < SURFACE[settings.opacity])
     level_bytes, samples = [], 0.0
     for number, level in enumerate(plan):
         tiles = len(store) if number == 0 else TILES_PER_AREA * area * 4**number
         numbers = int(tiles * ops.TILE**3 * pitch)
         rays = RAY_MARGIN * pixels / 4**level.halvings
-        needed = bytes_per_number(numbers, settings) * numbers + BYTES_PER_RAY * rays
+        needed = bytes_per_number(numbers, settings, device) * numbers + BYTES_PER_RAY * rays
         if settings.degree != settings.voxel_degree:  # coarse tiles are as many as they are larger
             coarse = int(tiles / settings.view_spacing**2 * ops.TILE**3 * ops.pitch(settings.degree))
-            needed += 4 * (3 + gradient_groups(coarse)) * coarse + VIEW_BYTES_PER_RAY * rays
-        level_bytes.append(int(needed))
+            needed += 4 * (3 + gradient_groups(coarse, device)) * coarse + VIEW_BYTES_PER_RAY * rays
+        level_bytes.append(int(needed) + (0 if device == CPU else TRACE_BYTES))
         step = settings.descent.step_of(level.last)
         samples += rays * level.iterations * SAMPLES_PER_RAY * DIAGONAL / step
     seconds = OVERHEAD * samples * SAMPLE_SECONDS[pitch] / torch.get_num_threads()
-    return Budget(level_bytes, seconds if store.device == CPU else None)
+    return Budget(level_bytes, seconds if device == CPU else None)
 
 
-def gradient_groups(numbers: int) -> int:
-    """How many partial gradients a field of so many numbers gets: as many as fit a fixed memory, whatever the threads."""
-    return max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
+def gradient_groups(numbers: int, device: torch.device = CPU, codes: bool = False) -> int:
+    """How many partial gradients a field of so many numbers, or codes, gets: as many as fit a fixed memory, whatever the
+    threads; one on a GPU, whose threads add atomically."""
+    if device != CPU:
+        return 1
+    return CODE_GROUPS if codes else max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
 
 
 def partial_gradients(store: Tensor, accumulator: int) -> Tensor:
     """Memory for the partial gradients [groups, T, 4, 4, 4, P] of a field of floats or codes, in so many bits."""
-    groups = gradient_groups(store.numel()) if store.is_floating_point() else CODE_GROUPS
+    groups = gradient_groups(store.numel(), store.device, not store.is_floating_point())
     dtype = {32: torch.float32, 16: torch.float16}[accumulator]
     return torch.empty(groups, *store.shape, dtype=dtype, device=store.device)
 
@@ -80,9 +84,9 @@ def partial_gradients(store: Tensor, accumulator: int) -> Tensor:
 LESS = "sh_degree=0, voxels 1.4 times as large or data.scale=0.5 halve it"
 
 
-def bytes_per_number(numbers: int, settings: FitSettings) -> float:
+def bytes_per_number(numbers: int, settings: FitSettings, device: torch.device = CPU) -> float:
     """What each of so many numbers of a field takes in training: value, two moments, partial gradients."""
-    groups = gradient_groups(numbers) if settings.storage == 32 else CODE_GROUPS
+    groups = gradient_groups(numbers, device, settings.storage < 32)
     if settings.gradient == "gather":
         groups = 1  # beside the slots, which are counted by samples
     return (3 * settings.storage + groups * settings.accumulator) / 8

@@ -74,7 +74,9 @@ class ViewColor:
         torch.mul(residual.clamp(-losses.huber, losses.huber), pull[:, None], out=by_value[:, 1:])
         table, frame = self.grid.table, frame_of(self.grid)
         read = (self.store, table, frame, self.points(rays), rays.directions)
-        gradient = ops.shade_backward(by_value, *read, groups=gradient_groups(self.store.numel()))
+        gradient = ops.shade_backward(
+            by_value, *read, groups=gradient_groups(self.store.numel(), self.store.device)
+        )
         terms = [0.0, losses.tv_color, losses.parsimony, 0.0, 0.0]
         ops.voxel_terms(self.store, table, frame, self.grid.places, terms, PARSIMONY_HUBER, 1.0, gradient)
         return gradient

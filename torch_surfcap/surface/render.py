@@ -16,7 +16,9 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_surfcap import ops
 from torch_surfcap.data.cameras import Cameras
+from torch_surfcap.devices import CPU
 from torch_surfcap.distance import Array, face_normals, row_dot
 
 if TYPE_CHECKING:
@@ -71,15 +73,16 @@ def pixel_rays(cameras: Cameras, i: int, pixels: Tensor) -> tuple[Tensor, Tensor
     return cameras.rays(i, torch.stack([pixels % width, pixels // width], dim=1) + 0.5)
 
 
-def cast(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Hits:
+def cast(mesh: trimesh.Trimesh, cameras: Cameras, i: int, device: torch.device = CPU) -> Hits:
     """First hits of the rays through camera i's pixel centres.
 
-    The ray caster finds the triangle in single precision; the point is then taken on its plane in double.
+    The triangle is found in single precision, on the CPU by a ray caster and elsewhere by a z-buffer, which leaves out
+    triangles that reach behind the camera; the point is then taken on its plane in double.
     """
     width, height = (int(s) for s in cameras.size[i])
     box = np.zeros((2, 3)) if len(mesh.faces) == 0 else np.array(mesh.bounds)
     pixels = window(cameras, i, *torch.from_numpy(box))
-    face = first_faces(mesh, cameras, i, pixels)
+    face = first_faces(mesh, cameras, i, pixels, device)
     hit = np.flatnonzero(face >= 0)
     face, pixels = face[hit], pixels[torch.from_numpy(hit)]
     origins, directions = (x.numpy() for x in pixel_rays(cameras, i, pixels))
@@ -94,12 +97,26 @@ def cast(mesh: trimesh.Trimesh, cameras: Cameras, i: int) -> Hits:
     return Hits((height, width), pixels.numpy(), face, point, directions, distance)
 
 
-def first_faces(mesh: trimesh.Trimesh, cameras: Cameras, i: int, pixels: Tensor) -> NDArray[np.int64]:
+def first_faces(
+    mesh: trimesh.Trimesh, cameras: Cameras, i: int, pixels: Tensor, device: torch.device
+) -> NDArray[np.int64]:
     """[M] the face that the ray through each of the pixels numbered [M] meets first, -1 where there is none."""
     if len(mesh.faces) == 0 or len(pixels) == 0:
         return np.full(len(pixels), -1)
+    if device.type != "cpu":
+        return z_buffer(mesh, cameras, i, device).flatten()[pixels].numpy().astype(np.int64)
     origins, directions = (x.numpy() for x in pixel_rays(cameras, i, pixels))
     return np.asarray(mesh.ray.intersects_first(origins, directions), dtype=np.int64)
+
+
+def z_buffer(mesh: trimesh.Trimesh, cameras: Cameras, i: int, device: torch.device) -> Tensor:
+    """[H, W] int32 on the CPU: the face that each pixel of camera i sees, found on a device; -1 where there is none."""
+    width, height = (int(s) for s in cameras.size[i])
+    vertices, faces = torch.tensor(mesh.vertices, device=device), torch.tensor(mesh.faces, device=device)
+    projection = cameras.projection_matrices()[i].to(device)
+    seen = vertices @ projection[:, :3].T + projection[:, 3]
+    corners = torch.cat([seen[:, :2] / seen[:, 2:], seen[:, 2:]], 1).float()
+    return ops.rasterize(corners, faces.int(), height, width).cpu()
 
 
 def raster(
@@ -114,7 +131,7 @@ def raster(
 
     hits: what `cast` found for this mesh and camera, where it is known already.
     """
-    hits = cast(mesh, cameras, i) if hits is None else hits
+    hits = cast(mesh, cameras, i, field.voxels.device) if hits is None else hits
     colors = torch.zeros(len(hits.pixel), 3)
     with torch.no_grad():
         for s in range(0, len(colors), CHUNK):
