@@ -27,7 +27,7 @@ GPU_SOURCES = sorted(glob("csrc/cuda/*.cu"))
 HOST = ["-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wno-psabi"]
 ABI = ["-DTORCH_TARGET_VERSION=0x020a000000000000", "-DPy_LIMITED_API=0x030A0000"]  # torch 2.10, Python 3.10
 COMMON = [*(["-O0", "-g"] if DEBUG else ["-O3", "-DNDEBUG"]), *ABI, "-Icsrc"]
-EMULATION = ["-DSURFCAP_CUDA_EMULATION", "-Itests/emulation"]
+EMULATION = ["-DSURFCAP_CUDA_EMULATION", "-Wno-unknown-pragmas", "-Itests/emulation"]
 
 
 def gencode(arch: str) -> str:

@@ -1,4 +1,5 @@
-// The schemas of all ops. What each does is said once, in torch_surfcap/ops.py; cpu/NAME.cpp and core/ implement it.
+// The schemas of all ops. What each does is said once, in torch_surfcap/ops; core/, drivers/NAME.h, cpu/NAME.cpp and
+// cuda/NAME.cu implement it.
 #include <torch/csrc/stable/library.h>
 
 // The arguments that describe a field, a bundle of rays and the march stand at the beginning of most schemas.

@@ -45,7 +45,7 @@ template <class Real, int N, class Stored> SURFCAP_HD Pack<Real, N> load_as(cons
 // Adds to N consecutive sums, in their scale; those of 16 bits are rounded to the nearest.
 template <class Real, int N, class Sum> SURFCAP_HD void add_to(Sum* to, const Pack<Real, N>& x) {
   if constexpr (std::is_same_v<Sum, Real>)
-    store<Real, N>(to, load<Real, N>(to) + x);
+    store_aligned<Real, N>(to, load_aligned<Real, N>(to) + x);
   else
     to_halves<N>(from_halves<N>(to) + x, to);
 }

@@ -106,6 +106,16 @@ template <class Real> class Lattice {
     return count;
   }
 
+  // The same for one index; false: the ray is at its end.
+  SURFCAP_HD bool next(int32_t& k) {
+    while (k_ < end_) {
+      if (k_ >= known_until_ && (left_ == kUnknown ? skip() : !next_range())) continue;
+      k = k_++;
+      return true;
+    }
+    return false;
+  }
+
  private:
   // Smallest k with t_k >= t, held to a range that an int can count.
   SURFCAP_HD int index_after(Real t) const {

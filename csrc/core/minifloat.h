@@ -95,12 +95,23 @@ template <int N> SURFCAP_HD Pack<float, N> from_halves(const Half* from) {
 template <int Cut, int N> SURFCAP_HD void cut_halves(const Pack<float, N>& x, const uint32_t* noise, uint8_t* to) {
   Half row[N];
   to_halves<N>(x, row);
+#if defined(SURFCAP_CUDA)
+  Pack<uint8_t, N> bytes;  // in one access
+  for (int i = 0; i < N; ++i) bytes[i] = uint8_t((row[i].bits + (noise[i] & ((1 << Cut) - 1))) >> Cut);
+  store_aligned<uint8_t, N>(to, bytes);
+#else
   for (int i = 0; i < N; ++i) to[i] = uint8_t((row[i].bits + (noise[i] & ((1 << Cut) - 1))) >> Cut);
+#endif
 }
 
 template <int Cut, int N> SURFCAP_HD Pack<float, N> uncut_halves(const uint8_t* from) {
   Half row[N];
+#if defined(SURFCAP_CUDA)
+  const Pack<uint8_t, N> bytes = load_aligned<uint8_t, N>(from);  // in one access
+  for (int i = 0; i < N; ++i) row[i].bits = uint16_t(bytes[i] << Cut);
+#else
   for (int i = 0; i < N; ++i) row[i].bits = uint16_t(from[i] << Cut);
+#endif
   return from_halves<N>(row);
 }
 

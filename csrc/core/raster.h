@@ -1,6 +1,8 @@
 // Triangles in a picture: which pixel centres each covers, and how near it is there.
 #pragma once
 
+#include <cmath>
+
 #include "pack.h"
 
 namespace surfcap {
@@ -19,11 +21,12 @@ SURFCAP_HD Covered covered_by(float nearness, int64_t face) {
 SURFCAP_HD int32_t face_of(Covered covered) { return covered == 0 ? -1 : int32_t(kFaceBits - (covered & kFaceBits)); }
 
 // Twice the area of (a, b, p), in the picture's axes. The side that two triangles share must give both the same number
-// but for the sign, or rounding leaves holes along it: it is taken in one order whichever of them asks.
+// but for the sign, or rounding leaves holes along it: it is taken in one order whichever of them asks, and
+// rounded in one way.
 template <class Real> SURFCAP_HD Real edge(const Real* a, const Real* b, Real x, Real y) {
   const bool turned = a[0] > b[0] || (a[0] == b[0] && a[1] > b[1]);
   const Real *const from = turned ? b : a, *const to = turned ? a : b;
-  const Real twice = (to[0] - from[0]) * (y - from[1]) - (to[1] - from[1]) * (x - from[0]);
+  const Real twice = std::fma(to[0] - from[0], y - from[1], -((to[1] - from[1]) * (x - from[0])));
   return turned ? -twice : twice;
 }
 

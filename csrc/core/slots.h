@@ -23,7 +23,9 @@ template <class Real> SURFCAP_HD void store_slot(Real* slot, const Pack<Real, 4>
   store_aligned<Real, 4>(slot, g);
 }
 template <class Real> SURFCAP_HD void store_slot(uint8_t* slot, const Pack<Real, 4>& g) {
-  for (int i = 0; i < 4; ++i) slot[i] = nearest_e5m2(float(g[i]));
+  Pack<uint8_t, 4> bytes;
+  for (int i = 0; i < 4; ++i) bytes[i] = nearest_e5m2(float(g[i]));
+  store_aligned<uint8_t, 4>(slot, bytes);
 }
 template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const Real* slot) { return load_aligned<Real, 4>(slot); }
 template <class Real> SURFCAP_HD Pack<Real, 4> load_slot(const uint8_t* slot) {

@@ -37,9 +37,9 @@ template <int Degree, class Real> struct TermSums {
     is_view = load<Real, R::kPart>(view);
   }
 
-  template <class Stored, class Sum>
-  SURFCAP_HD void add(const Field<Real, Stored>& field, const Code<Real, Degree, Stored>& code, int64_t cell,
-                      const VoxelTerms<Real>& terms, int64_t tile, int v, Sum* gradient) {
+  template <class Stored, class Coding, class Sum>
+  SURFCAP_HD void add(const Field<Real, Stored>& field, const Coding& code, int64_t cell, const VoxelTerms<Real>& terms,
+                      int64_t tile, int v, Sum* gradient) {
     const int32_t stride[3] = {field.n[1] * field.n[2], field.n[2], 1};
     const int32_t inner[3] = {kTile * kTile, kTile, 1};
     const auto read = [&](int64_t voxel) {

@@ -49,7 +49,7 @@ __global__ void __launch_bounds__(kVoxels)
       if (width == 0) continue;
       Stand<Real> stand;
       find_stand(field, coordinate, int(voxel % kTileVoxels), cameras, v, stand);
-      if (!within_reach(stand, 0)) continue;
+      if (!within_reach(stand, 0) || !(stand.samples[0] > Real(0))) continue;
       Pack<Real, 4> read = zero_pack<Real, 4>();
       for (int c = 0; c < 4; ++c) {
         Share<Real> share;

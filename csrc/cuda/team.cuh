@@ -12,6 +12,10 @@
 #include "../core/rays.h"
 #include "gpu.cuh"
 
+#if defined(__CUDACC__)
+#include <cuda_fp16.h>
+#endif
+
 namespace surfcap {
 inline namespace SURFCAP_ISA {
 
@@ -52,7 +56,7 @@ __device__ __forceinline__ void add_atomically(Half* to, float x) {
 __device__ __forceinline__ void add_atomically(float* to, float x) { atomicAdd(to, x); }
 __device__ __forceinline__ void add_atomically(double* to, double x) { atomicAdd(to, x); }
 
-// Adds to four consecutive sums. Memory rule: adds, atomically.
+// Adds to four consecutive sums. Memory rule: adds, atomically. Halves are rounded before they are added, too.
 template <class Real, class Sum> __device__ __forceinline__ void add_four(Sum* to, const Pack<Real, 4>& x) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   if constexpr (std::is_same_v<Sum, float>) {
@@ -60,8 +64,49 @@ template <class Real, class Sum> __device__ __forceinline__ void add_four(Sum* t
     return;
   }
 #endif
+#if defined(__CUDA_ARCH__)
+  if constexpr (std::is_same_v<Sum, Half>) {
+    Pack<float, 4> held;
+    for (int i = 0; i < 4; ++i) held[i] = clamped(x[i], -kMostHalf, kMostHalf);
+    auto* const pairs = reinterpret_cast<__half2*>(to);
+    atomicAdd(pairs, __floats2half2_rn(held[0], held[1]));
+    atomicAdd(pairs + 1, __floats2half2_rn(held[2], held[3]));
+    return;
+  }
+#endif
   for (int i = 0; i < 4; ++i) add_atomically(to + i, x[i]);
 }
+
+// The code of one part of the records, for a thread that has no other.
+template <class Real, int Degree, class Stored> struct PartCode {
+  using R = Record<Degree>;
+  Pack<Real, 4> low, scale;
+  Pack<Stored, 4> outside;  // what a missing tile holds there
+  Stored inside;            // the same inside, where it differs: in the first number
+
+  __device__ __forceinline__ PartCode(const Grid<Real>& grid, int part) {
+    const Code<Real, Degree, Stored> code(grid);
+#pragma unroll
+    for (int p = 0; p < R::kParts; ++p) {  // a choice, so that `code` stays in registers
+      if (p != part) continue;
+#pragma unroll
+      for (int i = 0; i < 4; ++i) {
+        low[i] = code.kNarrow ? code.low[4 * p + i] : Real(0);
+        scale[i] = code.kNarrow ? code.scale[4 * p + i] : Real(1);
+        outside[i] = code.missing[4 * p + i];
+      }
+    }
+    inside = part == 0 ? code.missing[R::kPitch] : outside[0];
+  }
+
+  // Of this part, or of a mean of them.
+  __device__ __forceinline__ Pack<Real, 4> decode(const Pack<Real, 4>& codes, int) const {
+    if constexpr (Code<Real, Degree, Stored>::kNarrow)
+      return low + codes * scale;
+    else
+      return codes;
+  }
+};
 
 // A field as one thread of a team reads it.
 template <class Real, int Degree, class Stored> class TeamField {
@@ -82,20 +127,7 @@ template <class Real, int Degree, class Stored> class TeamField {
   };
 
   __device__ __forceinline__ explicit TeamField(const Field<Real, Stored>& field)
-      : field_(field), part_(team.lane % kParts) {
-    const Code<Real, Degree, Stored> code(field);
-    for (int p = 0; p < kParts; ++p) {  // a choice, so that `code` stays in registers
-      if (p != part_) continue;
-      for (int i = 0; i < 4; ++i) {
-        if constexpr (Code<Real, Degree, Stored>::kNarrow) {
-          low_[i] = code.low[4 * p + i];
-          scale_[i] = code.scale[4 * p + i];
-        }
-        outside_[i] = code.missing[4 * p + i];
-        inside_[i] = code.missing[kPitch + 4 * p + i];
-      }
-    }
-  }
+      : field_(field), part_(team.lane % kParts), code_(field, part_) {}
 
   __device__ __forceinline__ Corner locate(const Pack<Real, 1> (&u)[3]) const {
     const Corners<Real> corners(field_, u);
@@ -116,7 +148,8 @@ template <class Real, int Degree, class Stored> class TeamField {
     for (int n = 0; n < kParts; ++n) {
       const Corner c = of(corner, n);
       found.weight[n] = c.weight;
-      found.record[n] = c.voxel == kInside ? inside_ : outside_;
+      found.record[n] = code_.outside;
+      if (c.voxel == kInside) found.record[n][0] = code_.inside;
       if (c.voxel >= 0)
         found.record[n] = load_aligned<Stored, 4>(field_.voxels + int64_t(c.voxel) * kPitch + 4 * part_);
     }
@@ -127,9 +160,7 @@ template <class Real, int Degree, class Stored> class TeamField {
   __device__ __forceinline__ Part read(const Fetched& found) const {
     Part sum = zero_pack<Real, 4>();
     for (int n = 0; n < kParts; ++n) sum += found.weight[n] * convert_pack<Real, 4, Stored>(found.record[n]);
-    sum = team.sum<Real>(sum, kParts, kTeam);
-    if constexpr (Code<Real, Degree, Stored>::kNarrow) sum = low_ + sum * scale_;
-    return sum;
+    return code_.decode(team.sum<Real>(sum, kParts, kTeam), part_);
   }
 
   // This thread's part of the basis in a direction, and (opacity, r, g, b) with it, the same in all threads.
@@ -148,10 +179,10 @@ template <class Real, int Degree, class Stored> class TeamField {
   template <class Sum>
   __device__ __forceinline__ void scatter(Sum* gradient, const Corner& corner, const Part& part) const {
     const Part g = Real(kSumScale<Sum>) * part;
-    for (int n = 0; n < kParts; ++n) {
-      const Corner c = of(corner, n);
-      if (c.voxel >= 0) add_four<Real>(gradient + int64_t(c.voxel) * kPitch + 4 * part_, c.weight * g);
-    }
+    Corner all[kParts];  // a branch between the shuffles would make the team meet anew for each
+    for (int n = 0; n < kParts; ++n) all[n] = of(corner, n);
+    for (int n = 0; n < kParts; ++n)
+      if (all[n].voxel >= 0) add_four<Real>(gradient + int64_t(all[n].voxel) * kPitch + 4 * part_, all[n].weight * g);
   }
   // The same for a gradient by (opacity, r, g, b).
   template <class Sum>
@@ -176,8 +207,7 @@ template <class Real, int Degree, class Stored> class TeamField {
 
   const Field<Real, Stored>& field_;
   int part_;
-  Part low_, scale_;
-  Pack<Stored, 4> outside_, inside_;  // what a tile that is missing holds
+  PartCode<Real, Degree, Stored> code_;
 };
 
 }  // namespace SURFCAP_ISA

@@ -21,7 +21,7 @@ __global__ void __launch_bounds__(kThreads, Walking::kResident)
       const auto sample = walk[n];
       const auto corner = walk.corner_of(sample.k);
       if (corner.voxel < 0 || !(corner.weight > Real(0))) continue;
-      raise(seen + 2 * int64_t(corner.voxel), sample.transmittance);
+      raise(seen + 2 * int64_t(corner.voxel), larger(sample.transmittance, Real(0)));
       raise(seen + 2 * int64_t(corner.voxel) + 1, larger((Real(1) - sample.a) * sample.transmittance, Real(0)));
     }
   });

@@ -2,9 +2,9 @@
 // halo in shared memory. Memory rule: adds to each voxel's own record, without atomics.
 #include "../drivers/voxel_terms.h"
 
-#include "../core/choices.h"
 #include "../core/voxels.h"
 #include "sums.cuh"
+#include "team.cuh"
 
 namespace surfcap {
 namespace {
@@ -16,17 +16,14 @@ __global__ void __launch_bounds__(kThreads)
     add_terms(const __grid_constant__ Field<Real, Stored> field, const int32_t* coordinates, VoxelTerms<Real> terms,
               double* rows, Sum* gradient) {
   using R = Record<Degree>;
-  const Code<Real, Degree, Stored> code(field);
+  const int p = int(threadIdx.x % R::kParts);  // the same in every turn: a stride is whole records
+  const PartCode<Real, Degree, Stored> code(field, p);
   double losses[kVoxelTerms] = {};
   for (int64_t i = first_item(); i < field.tiles * kTileVoxels * R::kParts; i += stride()) {
     const int64_t voxel = i / R::kParts, tile = voxel / kTileVoxels;
-#pragma unroll
-    for (int p = 0; p < R::kParts; ++p) {  // a choice, so that `code` stays in registers
-      if (i % R::kParts != p) continue;
-      TermSums<Degree, Real> sums(terms, p);
-      sums.add(field, code, cell_of(field, coordinates + 3 * tile), terms, tile, int(voxel % kTileVoxels), gradient);
-      sums.add_to_losses(losses);
-    }
+    TermSums<Degree, Real> sums(terms, p);
+    sums.add(field, code, cell_of(field, coordinates + 3 * tile), terms, tile, int(voxel % kTileVoxels), gradient);
+    sums.add_to_losses(losses);
   }
   sum_block(losses, rows + int64_t(blockIdx.x) * kVoxelTerms);
 }

@@ -16,6 +16,17 @@ constexpr int64_t kTraceBytes = int64_t(1)
                                 << 30;  // memory for samples: where rays are long, fewer of them are in flight
 constexpr int kWords = 8;               // numbers that a sample is remembered by
 
+// store_aligned, where the compiler would take the pack apart.
+template <class Real> __device__ __forceinline__ void store_once(Real* to, const Pack<Real, 4>& x) {
+#if defined(__CUDA_ARCH__)
+  if constexpr (sizeof(Real) == 4) {
+    asm volatile("st.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(to), "f"(x[0]), "f"(x[1]), "f"(x[2]), "f"(x[3]) : "memory");
+    return;
+  }
+#endif
+  store_aligned<Real, 4>(to, x);
+}
+
 // A ray walked forward; then `ray` is its result and (*this)[i] its i-th sample. Nothing in here points to another part
 // of it: all of it is to live in registers.
 template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
@@ -65,7 +76,8 @@ template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
       sample.k = ~sample.k;
       sample.before = opacity_.outside();
     } else {
-      __builtin_memcpy(&sample.before, words - kWords + 6, sizeof(Real));
+      const Real before = words[6 - kWords];
+      __builtin_memcpy(&sample.before, &before, sizeof(Real));
     }
     sample.t = time_of(sample.k);
     return sample;
@@ -93,7 +105,7 @@ template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
 
  private:
   __device__ __forceinline__ bool next(int32_t& k, typename Reader::Corner& corner) {
-    if (lattice_.next(&k, 1) == 0) return false;
+    if (!lattice_.next(k)) return false;
     corner = corner_of(k);
     return true;
   }
@@ -115,7 +127,7 @@ template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
       half[3] = Real(0);
       __builtin_memcpy(&half[3], &k, sizeof(k));
     }
-    if (reader_.team.lane < 2) store_aligned<Real, 4>(words_ + i * kWords + 4 * reader_.team.lane, half);
+    if (reader_.team.lane < 2) store_once(words_ + i * kWords + 4 * reader_.team.lane, half);
   }
 
   const Reader& reader_;
@@ -127,8 +139,8 @@ template <class Real, int Degree, class Opacity, class Stored> class TeamWalk {
 
 // What every kernel that walks rays is given.
 template <class Real, int Degree, class Opacity, class Stored> struct Walking {
-  // Blocks to a multiprocessor that the registers must do for: 128 a thread for float, twice that for double.
-  static constexpr int kResident = sizeof(Real) == 4 ? 2 : 1;
+  // Blocks to a multiprocessor that the registers must do for: in float 64 or 128 a thread, in double 255.
+  static constexpr int kResident = sizeof(Real) != 4 ? 1 : Degree == 0 ? 4 : 2;
 
   Field<Real, Stored> field;
   Rays<Real> rays;
@@ -155,7 +167,8 @@ template <class Real, class Stored, class Kernel, class F>
 void with_walking(const Gpu& gpu, const Tensor& like, const Field<Real, Stored>& field, const Rays<Real>& rays,
                   const RaySettings<Real>& settings, const Kernel& kernel, const F& f) {
   if (rays.count == 0) return;
-  const int64_t capacity = most_samples(static_cast<const Grid<Real>&>(field), settings.step);
+  // Odd, so that teams do not stand powers of two apart.
+  const int64_t capacity = most_samples(static_cast<const Grid<Real>&>(field), settings.step) | 1;
   const int64_t block_bytes = kTeamsPerBlock * capacity * kWords * int64_t(sizeof(Real));
   with_opacity(settings, [&]<class Opacity>(const Opacity& opacity) {
     with_degree(field.pitch, [&](auto degree) {

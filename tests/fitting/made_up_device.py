@@ -66,7 +66,7 @@ def played(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     name = func.__name__.partition(".")[0]
     tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
     there = [x for x in tensors if isinstance(x, There)]
-    here = [x for x in tensors if not isinstance(x, There) and x.dim() > 0]
+    here = [x for x in tensors if not isinstance(x, There) and x.dim() > 0 and not sparse(x)]
     if there and here and name not in CROSSING:
         raise RuntimeError(f"{func}: of {[tuple(x.shape) for x in here]} on the host and others there")
     result_there = bool(there) if name != "copy_" else isinstance(args[0], There)
@@ -79,11 +79,16 @@ def played(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     out = func(*unwrapped[0], **unwrapped[1])
 
     def wrapped(value: Any) -> Any:
-        if not isinstance(value, Tensor) or not result_there:
+        if not isinstance(value, Tensor) or not result_there or sparse(value):
             return value
         return wrappers.get(id(value)) if id(value) in wrappers else There(value)
 
     return tree_map(wrapped, out)
+
+
+def sparse(tensor: Tensor) -> bool:
+    """Whether it has no strides, and so cannot be held: it is let through, wherever it is."""
+    return tensor.layout != torch.strided
 
 
 class Moment:

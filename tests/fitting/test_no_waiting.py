@@ -38,7 +38,9 @@ def test_without_numbers(case: str) -> None:
     check("fake_device", case)
 
 
-@pytest.mark.parametrize("case", [CASES[3], CASES[4], "images=host plates=true sh_degree=0"])
+@pytest.mark.parametrize(
+    "case", [CASES[3], "storage=8 view_spacing=8", "images=host plates=true sh_degree=0"]
+)
 def test_a_whole_fit_there(case: str) -> None:
     """No step of a fit brings tensors of two devices together; it is the CPU's, and it can be stopped and gone on with."""
     check("made_up_device", case)

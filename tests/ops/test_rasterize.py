@@ -34,7 +34,7 @@ def test_a_square_behind_a_triangle(device: str, dtype: torch.dtype) -> None:
 
 def test_the_nearer_of_two_tilted_faces(device: str) -> None:
     """Depths 1 to 3 and 3 to 1 from left to right cross in the middle; 1/depth, not depth, is linear between."""
-    one = [[0.0, -9, 1], [8, -9, 3], [8, 9, 3], [0, 9, 1]]
+    one: list[list[float]] = [[0, -9, 1], [8, -9, 3], [8, 9, 3], [0, 9, 1]]
     other = [[x, y, 4 - z] for x, y, z in one]
     corners = torch.tensor(one + other, device=device)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=torch.int32, device=device)

@@ -1,26 +1,4 @@
-"""The raw operators ``torch.ops.torch_surfcap.*``: what each computes, its shapes, and its shape function.
-
-Every op exists once in ``csrc/core`` (mathematics), ``csrc/cpu`` (driver), :mod:`torch_surfcap.reference` (oracle) and
-``tests/ops``, under the same name. Gradients belong to :mod:`torch_surfcap.autograd`; nothing here is differentiable.
-
-The field arguments, the same for every op:
-
-* ``voxels [T, 4, 4, 4, P]``: a record of P = 4, 16, 32 numbers (SH degree 0, 1, 2) per voxel of a tile [x, y, z]:
-  the opacity value, then ``beta[lm, rgb]``, then zero padding.
-* ``table [X, Y, Z]`` int32: tile index, ``INSIDE``, or ``OUTSIDE - d``, which promises that every cell nearer than d
-  cells is empty as well. (Cell t is empty if the 8 tiles t .. t + 1 are outside.) The outermost tiles are outside.
-* ``frame``: [x, y, z of the table's low corner, voxel size, opacity value outside, opacity value inside].
-
-A fit's iteration (``photometric_step``, ``integration_ranges``, ``visibility``, ``voxel_terms``, ``adam_step``) also takes
-``voxels`` in uint8 or uint16, see :mod:`torch_surfcap.codes`, with everything else in float32 but for what is said below.
-
-The ray arguments: ``origins, directions [R, 3]`` (unit), ``shift [R]`` of the lattice t_k = (k + 1/2 + shift) * step in
-steps, ``background [R, 3]``, ``opacity`` 0 (the value is a transparency) or 1 (a signed distance in voxels with logistic
-``slope``), ``step`` in world units, ``stop``: a ray ends once its transmittance is lower (0: never).
-
-``groups`` is the number of partial gradients that are summed in a fixed order: results depend on it in the last bits,
-and never on the number of threads.
-"""
+"""The ops of a fit's iteration: value and gradient of the losses, and the step. See :mod:`torch_surfcap.ops`."""
 
 from __future__ import annotations
 
@@ -29,126 +7,9 @@ from typing import cast
 import torch
 from torch import Tensor
 
-import torch_surfcap._C  # (loads the library, which registers the ops)
-import torch_surfcap.shapes  # noqa: F401  (registers what they return)
-
-INSIDE = -1
-OUTSIDE = -2
-TILE = 4
-OPACITY = {"transparency": 0, "distance": 1}
-GROUPS = 4
-HALF_SCALE = 1024  # what gradients and moments in 16 and 8 bits are multiplied with, core/code.h
+from torch_surfcap.ops.records import GROUPS
 
 _ops = torch.ops.torch_surfcap
-
-
-def coefficients(sh_degree: int) -> int:
-    """Numbers that a voxel holds: the opacity value and three colour channels per harmonic."""
-    return 1 + 3 * (sh_degree + 1) ** 2
-
-
-def pitch(sh_degree: int) -> int:
-    """Numbers that a voxel's record occupies, padding included."""
-    return (4, 16, 32)[sh_degree]
-
-
-def degree_of(count: int) -> int:
-    """SH degree of a voxel of ``count`` numbers, padded or not."""
-    for sh_degree in range(3):
-        if count in (coefficients(sh_degree), pitch(sh_degree)):
-            return sh_degree
-    raise ValueError(
-        f"voxels: expected 4, 13, 16, 28 or 32 numbers per voxel (SH degree 0, 1, 2), got {count}"
-    )
-
-
-def padded(voxels: Tensor) -> Tensor:
-    """Records filled up to their pitch; the tensor itself where it is padded already. Differentiable."""
-    missing = pitch(degree_of(voxels.shape[-1])) - voxels.shape[-1]
-    return torch.nn.functional.pad(voxels, (0, missing)) if missing else voxels
-
-
-def sample_forward(voxels: Tensor, table: Tensor, frame: list[float], points: Tensor) -> Tensor:
-    """Trilinear read at ``points [N, 3]``: records [N, P]; a missing corner is black with the boundary's opacity."""
-    return cast(Tensor, _ops.sample_forward(voxels, table, frame, points))
-
-
-def sample_backward(
-    grad_values: Tensor,
-    voxels: Tensor,
-    table: Tensor,
-    frame: list[float],
-    points: Tensor,
-    groups: int = GROUPS,
-) -> Tensor:
-    """Adjoint of :func:`sample_forward` by the voxels: [T, 4, 4, 4, P]."""
-    return cast(Tensor, _ops.sample_backward(grad_values, voxels, table, frame, points, groups))
-
-
-def shade_forward(
-    voxels: Tensor, table: Tensor, frame: list[float], points: Tensor, directions: Tensor
-) -> Tensor:
-    """What ``points [N, 3]`` look like along unit ``directions [N, 3]``: [N, 4] opacity value, r, g, b, as the samples of
-    a ray read them."""
-    return cast(Tensor, _ops.shade_forward(voxels, table, frame, points, directions))
-
-
-def shade_backward(
-    grad_values: Tensor,
-    voxels: Tensor,
-    table: Tensor,
-    frame: list[float],
-    points: Tensor,
-    directions: Tensor,
-    groups: int = GROUPS,
-) -> Tensor:
-    """Adjoint of :func:`shade_forward` by the voxels: [T, 4, 4, 4, P]."""
-    field, seen = (voxels, table, frame), (points, directions)
-    return cast(Tensor, _ops.shade_backward(grad_values, *field, *seen, groups))
-
-
-def march_forward(
-    voxels: Tensor,
-    table: Tensor,
-    frame: list[float],
-    origins: Tensor,
-    directions: Tensor,
-    shift: Tensor,
-    background: Tensor,
-    opacity: int,
-    slope: float,
-    step: float,
-    stop: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The ray integral (paper eq. 4 to 6 with the exclusive transmittance): colour [R, 3], transmittance [R] and depth
-    [R] = sum w t / sum w, NaN where a ray meets nothing."""
-    field, rays = (voxels, table, frame), (origins, directions, shift, background)
-    return cast(
-        "tuple[Tensor, Tensor, Tensor]", _ops.march_forward(*field, *rays, opacity, slope, step, stop)
-    )
-
-
-def march_backward(
-    grad_color: Tensor,
-    grad_transmittance: Tensor,
-    grad_depth: Tensor,
-    voxels: Tensor,
-    table: Tensor,
-    frame: list[float],
-    origins: Tensor,
-    directions: Tensor,
-    shift: Tensor,
-    background: Tensor,
-    opacity: int,
-    slope: float,
-    step: float,
-    stop: float,
-    groups: int = GROUPS,
-) -> Tensor:
-    """Adjoint of :func:`march_forward` by the voxels (eq. 17 without its division): [T, 4, 4, 4, P]."""
-    grads, field = (grad_color, grad_transmittance, grad_depth), (voxels, table, frame)
-    rays, march = (origins, directions, shift, background), (opacity, slope, step, stop)
-    return cast(Tensor, _ops.march_backward(*grads, *field, *rays, *march, groups))
 
 
 def photometric_step(
@@ -299,48 +160,6 @@ def gather_gradient(
     _ops.gather_gradient(voxels, table, frame, coordinates, *cameras, shift, step, *rows, gradient)
 
 
-def integration_ranges(
-    voxels: Tensor,
-    table: Tensor,
-    frame: list[float],
-    origins: Tensor,
-    directions: Tensor,
-    shift: Tensor,
-    opacity: int,
-    slope: float,
-    step: float,
-    stop: float,
-    quiet: float,
-) -> tuple[Tensor, Tensor]:
-    """The stretches of rays that are worth sampling (paper, section 4.1), front to back.
-
-    They reach a step beyond the samples whose opacity value is under ``quiet``, and two steps beyond where a ray ends.
-
-    Returns:
-        offsets [R + 1] int64, where each ray's ranges begin, and ranges [M, 2]: begin and end, world units from the origin.
-    """
-    field, rays, march = (voxels, table, frame), (origins, directions, shift), (opacity, slope, step, stop)
-    return cast("tuple[Tensor, Tensor]", _ops.integration_ranges(*field, *rays, *march, quiet))
-
-
-def visibility(
-    voxels: Tensor,
-    table: Tensor,
-    frame: list[float],
-    origins: Tensor,
-    directions: Tensor,
-    shift: Tensor,
-    opacity: int,
-    slope: float,
-    step: float,
-    stop: float,
-    groups: int = GROUPS,
-) -> Tensor:
-    """Per voxel the largest T_k and the largest w_k of the samples that read it: [T, 4, 4, 4, 2]."""
-    field, rays = (voxels, table, frame), (origins, directions, shift)
-    return cast(Tensor, _ops.visibility(*field, *rays, opacity, slope, step, stop, groups))
-
-
 def voxel_terms(
     voxels: Tensor,
     table: Tensor,
@@ -392,31 +211,3 @@ def adam_step(
     """
     moments, bounds = (first, second), (rate, low, high)
     _ops.adam_step(voxels, gradient, *moments, *bounds, beta1, beta2, epsilon, t, seed, stochastic)
-
-
-def soft_hull(points: Tensor, projections: Tensor, masks: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
-    """The soft visual hull at ``points [N, 3]``: (value [N], number of cameras that see the point [N] int32).
-
-    The value is the least of the bilinearly read masks of the cameras that see the point, 0 where none does.
-
-    Args:
-        projections: [V, 3, 4] world to pixels. masks: all masks end to end. sizes: [V, 2] int64 width, height.
-    """
-    return cast("tuple[Tensor, Tensor]", _ops.soft_hull(points, projections, masks, sizes))
-
-
-def rasterize(corners: Tensor, faces: Tensor, height: int, width: int) -> Tensor:
-    """The nearest face at each pixel's centre, by a z-buffer: [height, width] int32, -1 where there is none.
-
-    Args:
-        corners: [V, 3] pixel position (pixel (0, 0) is centred at (1/2, 1/2)) and depth. faces: [F, 3] int32; those with a
-            corner that is not in front of the camera are left out.
-    """
-    return cast(Tensor, _ops.rasterize(corners, faces, height, width))
-
-
-def upscale(
-    voxels: Tensor, table: Tensor, frame: list[float], fine_coordinates: Tensor, fine_frame: list[float]
-) -> Tensor:
-    """Trilinear read of a field at the voxel centres of finer tiles ``[F, 3]`` (table coordinates): [F, 4, 4, 4, P]."""
-    return cast(Tensor, _ops.upscale(voxels, table, frame, fine_coordinates, fine_frame))
