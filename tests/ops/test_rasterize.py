@@ -36,7 +36,7 @@ def test_the_nearer_of_two_tilted_faces(device: str) -> None:
     """Depths 1 to 3 and 3 to 1 from left to right cross in the middle; 1/depth, not depth, is linear between."""
     one: list[list[float]] = [[0, -9, 1], [8, -9, 3], [8, 9, 3], [0, 9, 1]]
     other = [[x, y, 4 - z] for x, y, z in one]
-    corners = torch.tensor(one + other, device=device)
+    corners = torch.tensor(one + other, dtype=torch.float32, device=device)
     faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=torch.int32, device=device)
     seen = ops.rasterize(corners, faces, 1, 8)[0]
     assert [int(face) // 2 for face in seen] == [0, 0, 0, 0, 1, 1, 1, 1]
