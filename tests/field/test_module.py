@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from tests.field.test_field import OPACITIES, random_field, some_rays
+from tests.ops.fields import GRADCHECK
 from torch_surfcap import SurfaceField, ops
 from torch_surfcap.field.tiles import TileGrid, with_skips
 from torch_surfcap.ops import OUTSIDE
@@ -46,26 +47,28 @@ def test_any_optimiser_and_loss(optimiser: Any, degree: int, opacity: str) -> No
 
 @BOTH
 @DEGREES
-def test_gradcheck_of_rays(degree: int, opacity: str) -> None:
+def test_gradcheck_of_rays(degree: int, opacity: str, device: str) -> None:
     """By the voxels and the background, of colour, transmittance and depth."""
     field = random_field(degree, opacity)
-    origins, directions = some_rays(field, 16)
+    origins, directions = (r.to(device) for r in some_rays(field, 16))
+    field = field.to(device)
     met = field(origins, directions).transmittance < 0.99
     rays = (origins[met], directions[met])
-    background = torch.rand(len(rays[0]), 3, dtype=torch.float64, requires_grad=True)
+    background = torch.rand(len(rays[0]), 3, dtype=torch.float64, device=device, requires_grad=True)
 
     def render(voxels: Tensor, behind: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return torch.func.functional_call(field, {"voxels": voxels}, (*rays, behind))
 
     voxels = field.voxels.detach().requires_grad_()
-    assert torch.autograd.gradcheck(render, (voxels, background), fast_mode=True)
+    assert torch.autograd.gradcheck(render, (voxels, background), **GRADCHECK)
 
 
 @BOTH
 @DEGREES
-def test_gradcheck_of_points(degree: int, opacity: str) -> None:
+def test_gradcheck_of_points(degree: int, opacity: str, device: str) -> None:
     field = random_field(degree, opacity)
-    origins, directions = some_rays(field, 16)
+    origins, directions = (r.to(device) for r in some_rays(field, 16))
+    field = field.to(device)
     points = origins + 3 * directions
 
     class Read(torch.nn.Module):
@@ -81,7 +84,7 @@ def test_gradcheck_of_points(degree: int, opacity: str) -> None:
     def values(voxels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return torch.func.functional_call(read, {"field.voxels": voxels}, ())
 
-    assert torch.autograd.gradcheck(values, field.voxels.detach().requires_grad_(), fast_mode=True)
+    assert torch.autograd.gradcheck(values, field.voxels.detach().requires_grad_(), **GRADCHECK)
 
 
 def test_empty_rays_pass_no_nan() -> None:

@@ -39,7 +39,10 @@ def test_non_contiguous(name: str, device: str) -> None:
     scene = make_scene(device=device)
     plain = run(ops, name, arguments(name, scene))
     for actual, expected in zip(run(ops, name, arguments(name, scene.non_contiguous())), plain, strict=True):
-        assert torch.equal(actual, expected)
+        if device == "cpu":
+            assert torch.equal(actual, expected)
+        else:  # the order of sums is left to chance
+            assert_close(actual, expected.cpu(), 1e-13)
 
 
 @pytest.mark.parametrize("rays", [0, 1])

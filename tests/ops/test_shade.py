@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.ops.calls import normal, points_of
-from tests.ops.fields import assert_close, make_scene, one_tile
+from tests.ops.fields import GRADCHECK, assert_close, make_scene, one_tile
 from torch_surfcap import ops
 from torch_surfcap.autograd import ShadePoints
 
@@ -41,7 +41,7 @@ def test_gradcheck(degree: int, device: str) -> None:
     voxels = scene.voxels.requires_grad_()
     seen = (points_of(scene), scene.directions)
     assert torch.autograd.gradcheck(
-        lambda v: ShadePoints.apply(v, scene.table, scene.frame, *seen), voxels, fast_mode=True
+        lambda v: ShadePoints.apply(v, scene.table, scene.frame, *seen), voxels, **GRADCHECK
     )
 
 

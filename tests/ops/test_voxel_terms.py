@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.ops.calls import arguments, ops
-from tests.ops.fields import assert_close, make_scene, one_tile
+from tests.ops.fields import GRADCHECK, assert_close, make_scene, one_tile
 from torch_surfcap.autograd import VoxelTerms
 from torch_surfcap.reference import INSIDE
 
@@ -87,7 +87,7 @@ def test_gradcheck(degree: int, device: str) -> None:
             voxels, scene.table, scene.frame, scene.coordinates, [0.3, 0.7, 0.2, 0.4, 0.5], 0.1, 0.05
         )[0]
 
-    assert torch.autograd.gradcheck(total, scene.voxels.requires_grad_(), fast_mode=True)
+    assert torch.autograd.gradcheck(total, scene.voxels.requires_grad_(), **GRADCHECK)
 
 
 def test_wrong_arguments_are_named(device: str, looked_into: bool) -> None:
