@@ -1,4 +1,5 @@
 # make setup | fit | test | check | cuda-check | format | bench
+# make gpu-check DATA=folder RESULTS=folder: on a machine with a GPU and without a network, see train/gpu_check.py
 # PYTHON chooses the interpreter; its own torch >= 2.10 is used if it has one, else TORCH is installed.
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
@@ -28,7 +29,7 @@ if sys.prefix != sys.base_prefix:
 endef
 export SHOW_PARENT
 
-.PHONY: setup fit test check cuda-check format bench
+.PHONY: setup fit test check cuda-check format bench gpu-check
 .DELETE_ON_ERROR:
 
 setup: $(STAMP) $(LIBRARY)
@@ -75,3 +76,6 @@ format: setup
 
 bench: setup
 	$(BIN)/python train/bench.py --out docs/benchmarks.md
+
+gpu-check:  # by PYTHON itself: where nothing can be installed there is no VENV
+	@$(PYTHON) -m train.gpu_check --data "$(DATA)" --results "$(RESULTS)"
