@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from train.gpu_numbers import KERNELS, METRICS, kernels_of_ncu, registers_of, run_numbers, tests_of
+from train.gpu_numbers import KERNELS, METRICS, junit_counts, kernels_of_ncu, registers_of, run_numbers
 from train.gpu_page import page
 from train.gpu_steps import Steps
 
@@ -184,7 +184,7 @@ class Check:
             self.steps.command(name, command, log, 100, keep=150, needs=["library"])
             if junit.is_file():
                 with self.steps.guarded(f"numbers of {name}"):
-                    self.numbers["tests"][name] = tests_of(junit)
+                    self.numbers["tests"][name] = junit_counts(junit)
 
     def _fit(self, name: str, given: list[str], most: float, keep: float) -> None:
         out, log, device = self.work / name, self.results / "fits.log", given[-1].partition("=")[2]

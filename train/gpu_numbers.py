@@ -111,7 +111,7 @@ def run_numbers(run: Path) -> dict[str, Any]:
     return numbers
 
 
-def tests_of(path: Path) -> dict[str, Any]:
+def junit_counts(path: Path) -> dict[str, Any]:
     """Counts of a junit file, and the names of the tests that failed."""
     found: dict[str, Any] = {"passed": 0, "failed": 0, "skipped": 0, "names": []}
     for case in ElementTree.parse(path).getroot().iter("testcase"):
