@@ -78,4 +78,5 @@ bench: setup
 	$(BIN)/python train/bench.py --out docs/benchmarks.md
 
 gpu-check:  # by PYTHON itself: where nothing can be installed there is no VENV
+	$(if $(and $(DATA),$(RESULTS)),,$(error gpu-check: expected DATA=folder RESULTS=folder))
 	@$(PYTHON) -m train.gpu_check --data "$(DATA)" --results "$(RESULTS)"

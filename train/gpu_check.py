@@ -3,7 +3,7 @@
     python -m train.gpu_check --data DATA --results RESULTS        (make gpu-check DATA=... RESULTS=...)
 
 Needs nvcc and a torch with CUDA. DATA holds captures in folders: lego* is fitted at SH degree 2 with either opacity, human*
-on the GPU and on the CPU, any other as it comes; DATA/wheels holds the Python packages that the machine lacks. RESULTS gets
+on the GPU and on the CPU, any other as it comes; DATA/wheels holds the Python packages that the machine lacks (setuptools, pytest and pytest-xdist too). RESULTS gets
 gpu.json, all numbers; benchmarks-gpu.md, the same as tables; build.log, tests.log and fits.log. A step that fails or runs
 out of its time is recorded, and the next one runs. Exit 0 if none failed, 1 if one did, 2 where there is no GPU to check.
 """
@@ -108,7 +108,7 @@ def _said(command: Sequence[str]) -> str | None:
 def fits_of(data: Path) -> dict[str, list[str]]:
     """The settings of each fit, by its name, the most wanted first."""
     found: dict[str, list[str]] = {}
-    captures = [p for p in sorted(data.iterdir()) if p.is_dir() and p.name != WHEELS]
+    captures = [p for p in sorted(data.iterdir()) if p.is_dir() and p.name[0] != "." and p.name != WHEELS]
     for path in sorted(captures, key=lambda p: not p.name.startswith("lego")):
         given = [f"data.path={path}"]
         if (path / "transforms_train.json").is_file() and not (path / "transforms_test.json").is_file():
@@ -167,7 +167,7 @@ class Check:
             pip = ["-m", "pip", "install", "-q", "--no-index", "--no-deps"]
             self._python("wheels", [*pip, "--target", str(self.work / "packages"), *wheels], log, 60)
         self._python("build", ["setup.py", "build_ext", "--inplace"], log, 240, keep=120)
-        self._python("library", ["-c", LIBRARY], log, 30, needs=["build"])
+        self._python("library", ["-c", LIBRARY], log, 90, needs=["build"])
 
     def _test(self) -> None:
         cores = self.machine["cores"]

@@ -22,14 +22,16 @@ COLOR, REST = 1e-5, 1e-4
 # where, rounding decides otherwise now and then. Colours change by 1 within a voxel beside missing tiles, and a position
 # is known to some 5e-6 voxels: as many of them may be off by up to REST.
 RARE = 1e-3
-DECIDED = (
-    "photometric_lattice",
-    "gather_gradient",
-    "visibility",
-    "soft_hull",
-    "rasterize",
-    "integration_ranges",
-)
+DECIDED = {
+    "photometric_lattice": RARE,
+    "gather_gradient": RARE,
+    "visibility": RARE,
+    "soft_hull": RARE,
+    "rasterize": RARE,
+    "integration_ranges": RARE,
+    "march_backward": RARE / 10,  # the kink of a = min(1, ...)
+    "photometric_step": RARE / 10,
+}
 COLORS = {"march_forward": 0, "photometric_step": 2, "photometric_lattice": 1}
 
 
@@ -88,7 +90,7 @@ def agree(name: str, there: Sequence[Tensor], here: Sequence[Tensor], dtype: tor
         scale = float(b.double().abs().max()) if b.numel() else 1.0
         bounds = {EXACT * scale: 0.0}
         if dtype == torch.float32:
-            bounds = {REST * scale: RARE if name in DECIDED else 0.0}
+            bounds = {REST * scale: DECIDED.get(name, 0.0)}
             bounds |= {COLOR: RARE} if i == COLORS.get(name) else {}
         for bound, share in bounds.items():
             beyond = int((~((a.cpu().double() - b.double()).abs() <= bound)).sum())
