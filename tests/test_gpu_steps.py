@@ -50,6 +50,22 @@ def test_a_step_and_its_children_end_with_its_time(tmp_path: Path) -> None:
     assert not mark.exists()
 
 
+def test_a_step_may_say_what_it_knows(tmp_path: Path) -> None:
+    code = """
+import signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+try:
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("so far")
+"""
+    run, start = steps(tmp_path), time.monotonic()
+    assert not run.command("slow", python(code), tmp_path / "log", 5.0)
+    assert time.monotonic() - start < 6
+    assert results(run) == {"slow": "out of time"}
+    assert (tmp_path / "log").read_text().endswith("so far\n")
+
+
 def test_time_is_shared(tmp_path: Path) -> None:
     run = steps(tmp_path, seconds=100.0)
     assert run.limit(30.0) == 30.0

@@ -3,9 +3,10 @@
     python -m train.gpu_check --data DATA --results RESULTS        (make gpu-check DATA=... RESULTS=...)
 
 Needs nvcc and a torch with CUDA. DATA holds captures in folders: lego* is fitted at SH degree 2 with either opacity, human*
-on the GPU and on the CPU, any other as it comes; DATA/wheels holds the Python packages that the machine lacks (setuptools, pytest and pytest-xdist too). RESULTS gets
-gpu.json, all numbers; benchmarks-gpu.md, the same as tables; build.log, tests.log and fits.log. A step that fails or runs
-out of its time is recorded, and the next one runs. Exit 0 if none failed, 1 if one did, 2 where there is no GPU to check.
+on the GPU and on the CPU, any other as it comes; DATA/wheels holds the Python packages that the machine lacks (setuptools,
+pytest and, for speed, pytest-xdist too). RESULTS gets gpu.json, all numbers; benchmarks-gpu.md, the
+same as tables; build.log, tests.log and fits.log. A step that fails or runs out of its time is recorded, and the next one
+runs. Exit 0 if none failed, 1 if one did, 2 where there is no GPU to check; make itself says 2 for both.
 """
 
 from __future__ import annotations

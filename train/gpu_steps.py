@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 LEAST = 5.0  # seconds without which a step is not begun
+GRACE = 3.0  # of a step's seconds, from its interruption to its end: pytest then says what it knows
 DONE = "done"
 
 
@@ -111,9 +112,12 @@ class Steps:
             self._tell(name, 0.0, limit, f"failed, {error}", failed=True)
             return False
         try:
-            result = DONE if child.wait(limit) == 0 else f"failed, exit {child.returncode}"
+            result = DONE if child.wait(limit - GRACE) == 0 else f"failed, exit {child.returncode}"
         except subprocess.TimeoutExpired:
             result = "out of time"
+            child.send_signal(signal.SIGINT)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(GRACE)
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
