@@ -4,9 +4,9 @@
 
 Needs nvcc and a torch with CUDA. DATA holds captures in folders: lego* is fitted at SH degree 2 with either opacity, human*
 on the GPU and on the CPU, any other as it comes; DATA/wheels holds the Python packages that the machine lacks (setuptools,
-pytest and, for speed, pytest-xdist too). RESULTS gets gpu.json, all numbers; benchmarks-gpu.md, the
-same as tables; build.log, tests.log and fits.log. A step that fails or runs out of its time is recorded, and the next one
-runs. Exit 0 if none failed, 1 if one did, 2 where there is no GPU to check; make itself says 2 for both.
+pytest and, for speed, pytest-xdist too). RESULTS gets gpu.json, all numbers; benchmarks-gpu.md, the same as tables;
+build.log, tests.log and fits.log. A step that fails or runs out of its time is recorded, and the next one runs. Exit 0 if
+none failed, 1 if one did, 2 where there is no GPU to check; make itself says 2 for both.
 """
 
 from __future__ import annotations
@@ -149,11 +149,13 @@ class Check:
         print(f"{self.machine['gpu']}, torch {self.machine['torch']}; results in {self.results}", flush=True)
         self._build()
         self._test()
+        self._write()
         fits = fits_of(self.data)
         for i, name in enumerate(name for name in fits if not name.endswith(CPU)):
             self._fit(name, fits[name], 120, keep=0.0 if i else 60.0)
             if i < PROFILED:
                 self._profile(name)
+            self._write()  # as far as it is known, lest something ends it all
         self._kernels()
         for name in fits:
             if name.endswith(CPU):  # last, because they take what time is left
