@@ -141,13 +141,14 @@ def kernels_of_ncu(text: str) -> list[dict[str, Any]]:
 
 
 def registers_of(text: str) -> dict[str, dict[str, int]]:
-    """Of what `cuobjdump --dump-resource-usage` prints: for each of KERNELS how many variants there are, and the most
-    registers and bytes of stack, where registers spill to, that one of them takes."""
+    """Of what `cuobjdump --dump-resource-usage` prints: for each of KERNELS in either precision how many variants there
+    are, and the most registers and bytes of stack, where registers spill to, that one of them takes."""
     found: dict[str, dict[str, int]] = {}
     usage = re.compile(r"Function (\S+?):\s*\n\s*REG:(\d+) STACK:(\d+)")
     for name, registers, stack in usage.findall(text):
         kernel = next((k for k in KERNELS if k in name), None)
         if kernel is not None:
+            kernel += ", double" if "WalkingId" in name else ", float"
             of = found.setdefault(kernel, {"variants": 0, "registers": 0, "stack": 0})
             of["variants"] += 1
             of["registers"] = max(of["registers"], int(registers))

@@ -204,7 +204,7 @@ def _kernels(numbers: Mapping[str, Any]) -> list[str]:
     if registers:
         head = ("kernel", "variants", "most registers", "most stack, bytes")
         rows = [[k, *(v[n] for n in ("variants", "registers", "stack"))] for k, v in registers.items()]
-        parts += ["As compiled, double precision included:", table(head, rows)]
+        parts += ["As compiled:", table(head, rows)]
     launches = numbers.get("ncu") or []
     if launches:
         head = tuple(dict.fromkeys(key for launch in launches for key in launch))
