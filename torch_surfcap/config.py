@@ -99,6 +99,7 @@ class DescentConfig:
 class CamerasConfig:
     skip: list[str] = field(default_factory=list)  # names or numbers of cameras to leave out
     take: int = _within(0, 0)  # so many training cameras, evenly spread; 0: all
+    reject: str = _one_of("auto", *CHOICES["reject"])  # auto: leave out those that contradict the others
 
 
 @dataclass
@@ -198,6 +199,7 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "levels": config.levels,
         "gains": config.gains,
         "gain_per": config.gain_per,
+        "reject": config.cameras.reject,
         "floor": config.floor,
         "start": config.start,
         "upscale": config.upscale,
@@ -363,4 +365,4 @@ def _check(config: Any, source: str, prefix: str = "") -> None:
 
 # Fields in which "auto" is a word like any other.
 _SAYS_ON = {"gains", "floor"}  # and on and off, which YAML takes for true and false
-_SAYS_AUTO = {"data.format", "device", "images", "gains", "floor"}
+_SAYS_AUTO = {"cameras.reject", "data.format", "device", "images", "gains", "floor"}

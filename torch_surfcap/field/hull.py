@@ -54,7 +54,7 @@ class Silhouettes:
 
     def hull(self, points: Tensor) -> Tensor:
         """Hull value at world points [..., 3]: float32 in [0, 1], 0 where fewer than ``quorum`` cameras look."""
-        value, votes = self._ask(points)
+        value, votes = self.ask(points)
         return torch.where(votes >= self.quorum, value, 0.0)
 
     def occupied(self, points: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ class Silhouettes:
 
         A piece of which no point is seen by half as many cameras as the best seen point is a phantom and left out.
         """
-        value, votes = self._ask(points)
+        value, votes = self.ask(points)
         occupied = (value > 0.5) & (votes >= self.quorum)
         numbers, count = label(occupied.cpu().numpy(), np.ones((3, 3, 3)))
         pieces = torch.from_numpy(numbers).to(votes.device).long()
@@ -71,7 +71,7 @@ class Silhouettes:
         seen[0] = 0  # what is not occupied
         return occupied & (2 * seen >= votes.max())[pieces]
 
-    def _ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def ask(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Least mask and number of the cameras that see world points [..., 3], both [...], on the points' device."""
         flat = points.reshape(-1, 3)
         # Shifting the world to the points' middle keeps single precision exact to far below a pixel.
@@ -110,7 +110,7 @@ def find_box(capture: Capture) -> tuple[Tensor, Tensor]:
     """
     if capture.masks is None:
         raise InputError("capture: no masks, expected silhouettes (Capture.masks) for the scene's box")
-    center, radius = _first_guess(capture)
+    center, radius = first_guess(capture)
     low, high = center - radius, center + radius
     volume = torch.prod(high - low)
     for _ in range(BOX_ROUNDS):
@@ -131,7 +131,7 @@ def find_box(capture: Capture) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _first_guess(capture: Capture) -> tuple[Tensor, float]:
+def first_guess(capture: Capture) -> tuple[Tensor, float]:
     """A cube that holds the hull: the point where the cameras' looks meet, and twice how far the silhouettes reach around
     it as the cameras see them (the median over the cameras)."""
     cameras = capture.cameras

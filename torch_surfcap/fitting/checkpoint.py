@@ -42,12 +42,15 @@ VIEW = "view_"  # begins the names of what is the view-dependent colour's own
 @dataclass
 class Record:
     """What a fit has to tell so far. warnings; history: a row per iteration; seconds: of the levels that are done;
-    level_bytes: what each level was estimated to need."""
+    level_bytes: what each level was estimated to need; left_out: cameras, by name, and why; difference: of each camera's
+    photograph from what the field shows."""
 
     warnings: list[str] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
     seconds: list[dict[str, float]] = field(default_factory=list)
     level_bytes: list[int] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+    difference: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass

@@ -15,13 +15,14 @@ from torch_surfcap.data.checks import prepare
 from torch_surfcap.data.floor import find_floor
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
+from torch_surfcap.fitting import outliers
 from torch_surfcap.fitting.budget import Budget, estimate, lack, shortage
 from torch_surfcap.fitting.checkpoint import Checkpoints, Record, Saved
 from torch_surfcap.fitting.descent import descend
 from torch_surfcap.fitting.late import Stopwatch
 from torch_surfcap.fitting.levels import Level, first_field, plan_levels, subject_box
 from torch_surfcap.fitting.settings import FitSettings
-from torch_surfcap.fitting.stage import Outcome, Stage, Studio, begin_stage, next_stage, open_studio
+from torch_surfcap.fitting.stage import Outcome, Stage, Studio, begin_stage, next_stage, open_studio, rendered
 
 if TYPE_CHECKING:
     import trimesh
@@ -103,6 +104,10 @@ def _fit(
     seconds: dict[str, Any] = {}
     watch = Stopwatch(seconds)
     capture = prepare(capture)
+    left_out: dict[str, str] = {}
+    if s.reject == "auto":
+        capture, left_out = _without_contradicting(capture)
+        watch.lap("reject")
     s = s.suited(capture.mask_source)
     saved = None if checkpoints is None else checkpoints.load()
     if saved is not None and checkpoints is not None:
@@ -114,6 +119,7 @@ def _fit(
     watch.lap("floor")
     studio = open_studio(capture, s, plan[0].halvings, floor)
     so_far = Record(list(capture.warnings)) if saved is None else Record(**saved.plain["record"])
+    so_far.left_out = left_out | so_far.left_out
     run = _Run(s, capture, box, plan, studio, so_far, saved, checkpoints, report)
     resumed = len(so_far.history)
     outcome = run.outcome(watch)
@@ -131,12 +137,24 @@ def _fit(
         so_far.history,
         exposure.gain,
         exposure.bias,
-        _chosen(s, box, outcome, plan, studio),
+        _chosen(s, box, outcome, plan, studio, so_far),
         seconds,
         so_far.warnings,
         None if saved is None else saved.place,
         len(so_far.history) - resumed,
     )
+
+
+def _without_contradicting(capture: Capture) -> tuple[Capture, dict[str, str]]:
+    """The capture without the cameras whose silhouettes contradict the others', and why, by name."""
+    found = outliers.by_silhouettes(capture)
+    if not found:
+        return capture, {}
+    kept = capture.subset([i for i in range(len(capture)) if i not in found])
+    kept.prepared, kept.test = capture.prepared, capture.test
+    left_out = {capture.names[i]: why for i, why in found.items()}
+    kept.warnings += [f"camera {name} is left out: {why}" for name, why in left_out.items()]
+    return kept, left_out
 
 
 @dataclass
@@ -160,6 +178,7 @@ class _Run:
         """
         s, device, before = self.settings, torch.device(self.settings.device), None
         number = 0 if self.saved is None else self.saved.place[0]
+        self._leave_out()
         try:
             stage = self._begin(watch)
             self._descend(stage)
@@ -209,7 +228,29 @@ class _Run:
             self.report(Progress(stage.number, len(self.plan), stage.level, voxels, row))
             if self.checkpoints is not None and self.checkpoints.due():
                 self._save(stage)
+        self._judge(stage)
         self.so_far.seconds.append(stage.seconds)
+
+    def _judge(self, stage: Stage) -> None:
+        """How far the photographs are from the level's field; those that are far have no part in the next level."""
+        so_far, watch, names = self.so_far, Stopwatch(stage.seconds, stage.store.device), self.capture.names
+        difference = outliers.differences(stage.rays, rendered(stage, self.settings)).cpu()
+        so_far.difference = {n: float(x) for n, x in zip(names, difference, strict=True) if x.isfinite()}
+        if self.settings.reject == "auto" and stage.number < len(self.plan) - 1:
+            for i, why in outliers.by_photographs(difference).items():
+                so_far.left_out[names[i]] = why
+                so_far.warnings.append(
+                    f"camera {names[i]} is left out from level {stage.number + 2} on: {why}"
+                )
+            self._leave_out()
+        watch.lap("judge")
+        watch.stop()
+
+    def _leave_out(self) -> None:
+        """Takes the rays of the cameras that are left out after a level from the levels to come."""
+        gone = {i for i, name in enumerate(self.capture.names) if name in self.so_far.left_out}
+        if gone:
+            self.studio.leave_out(gone)
 
     def _save(self, stage: Stage) -> None:
         if self.checkpoints is not None:
@@ -229,7 +270,12 @@ class _Run:
 
 
 def _chosen(
-    s: FitSettings, box: tuple[Tensor, Tensor], outcome: Outcome, plan: list[Level], studio: Studio
+    s: FitSettings,
+    box: tuple[Tensor, Tensor],
+    outcome: Outcome,
+    plan: list[Level],
+    studio: Studio,
+    so_far: Record,
 ) -> dict[str, Any]:
     """What the fit chose, and why."""
     cut = "memory" if outcome.number < len(plan) - 1 else None
@@ -246,6 +292,12 @@ def _chosen(
         "box": {
             "value": [*box[0].tolist(), *box[1].tolist()],
             "reason": "silhouettes" if s.box is None else "given",
+        },
+        "cameras": {
+            "value": len(so_far.difference),
+            "left_out": so_far.left_out,
+            "difference": so_far.difference,
+            "reason": "all that agree" if s.reject == "auto" else "all, as given",
         },
         "floor": {
             "value": studio.floor and [*studio.floor.normal.tolist(), studio.floor.offset],

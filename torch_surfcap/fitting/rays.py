@@ -146,7 +146,7 @@ def gather_rays(
     visit: str = "ranges",
 ) -> RayBatch:
     """The rays of all cameras that meet anything in the field (the others are culled), still without colours; all rays
-    where ``visit`` is "box".
+    where ``visit`` is "box". A camera whose silhouette is empty has none.
 
     The weight of a ray is 1/(number of views * rho), rho = (voxel * focal / distance)^2 being the pixels that a voxel's
     face covers: the gradient on a voxel then depends neither on the number of cameras nor on the image size nor on the
@@ -154,7 +154,9 @@ def gather_rays(
     """
     assert capture.masks is not None
     if visit == "box":
-        everywhere = [_blocked(torch.ones_like(mask).nonzero()).to(store.device) for mask in capture.masks]
+        everywhere = [
+            _blocked((mask.amax() > 0).expand_as(mask).nonzero()).to(store.device) for mask in capture.masks
+        ]
         widths = capture.cameras.size[:, 0].tolist()
         pixels = [(i[:, 0] * w + i[:, 1]).int() for i, w in zip(everywhere, widths, strict=True)]
         return rays_of(capture, grid, pixels, None)

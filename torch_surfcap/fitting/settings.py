@@ -78,6 +78,7 @@ VIEW_SPACINGS = (1, 4, 8)
 CHOICES = {
     "gains": ("auto", "on", "off"),
     "gain_per": ("channel", "camera"),
+    "reject": ("auto", "off"),
     "floor": ("auto", "off"),
     "start": ("hull", "constant"),
     "upscale": ("plain", "sqrt"),
@@ -102,6 +103,7 @@ class FitSettings:
                brings far more where they are not. View-dependent colours (sh_degree > 0) take a part of what are gains:
                their values are then less true, the pictures are not
     gain_per:  "channel" or "camera", what has a gain and bias of its own
+    reject:    "auto": cameras that contradict the others are left out (see ``torch_surfcap.fitting.outliers``); "off"
     floor:     "auto": nothing lies below the floor that the plates show, where they show one; "off"
     start:     "hull": the first field falls off at the hull's surface; "constant": a transparency is the same fog inside
     upscale:   "plain" or "sqrt": a transparency at a change of level stays, or becomes its root, so that two fine voxels
@@ -129,6 +131,7 @@ class FitSettings:
     box: tuple[float, ...] | None = None
     gains: str = "auto"
     gain_per: str = "channel"
+    reject: str = "auto"
     floor: str = "auto"
     start: str = "constant"
     upscale: str = "plain"

@@ -52,6 +52,15 @@ class Studio:
         if images == "device":
             self.pictures = [capture.on(device) for capture in self.pictures]
 
+    def leave_out(self, cameras: set[int]) -> None:
+        """From the next level on these cameras have no rays: their silhouettes are empty."""
+        for n, capture in enumerate(self.pictures):
+            assert capture.masks is not None
+            without = capture.subset(range(len(capture)))
+            without.prepared = capture.prepared
+            without.masks = [torch.zeros_like(m) if i in cameras else m for i, m in enumerate(capture.masks)]
+            self.pictures[n] = without
+
     def fit_exposure(self, stage: Stage, color: Tensor, transmittance: Tensor) -> None:
         """Takes the cameras' gains out of renderings of a stage's rays, [R, 3] and [R], and exposes the rays anew."""
         capture = self.pictures[stage.level.halvings]
@@ -131,6 +140,18 @@ class Outcome:
         """As a module."""
         view = self.view and SurfaceField(self.view[1], self.view[0], KIND)
         return SurfaceField(self.decoded(opacity, floor), self.grid, opacity, self.step, view)
+
+
+def rendered(stage: Stage, settings: FitSettings) -> Tensor:
+    """[R, 3] what the rays of a stage see now, in the common exposure."""
+    rays, shift = stage.rays, torch.zeros_like(stage.rays.mask)
+    offset = None if stage.view is None else stage.view.seen_by(rays)
+    background = rays.background if offset is None else rays.background - offset
+    missing = MISSING[settings.opacity]
+    store = codes.decode(stage.store, *missing)
+    seen = (rays.origins, rays.directions, shift, background)
+    color = ops.march_forward(store, stage.grid.table, stage.grid.frame(*missing), *seen, *stage.march)[0]
+    return color if offset is None else color + offset
 
 
 def march_of(settings: FitSettings, level: Level) -> March:
