@@ -55,7 +55,7 @@ def test_too_few_to_say() -> None:
 
 
 def test_photographs_far_from_the_others() -> None:
-    difference = torch.tensor([0.05, 0.06, torch.nan, 0.2, 0.05, 0.07, 0.05, 0.06])
+    difference = torch.tensor([0.05, 0.06, torch.nan, 0.3, 0.05, 0.07, 0.05, 0.06])
     assert list(outliers.by_photographs(difference)) == [3]
     assert outliers.by_photographs(0.01 * difference) == {}  # none is wrong by anything that shows
     half = torch.tensor([0.05, 0.05, 0.05, 0.3, 0.3, 0.3, 0.05, 0.05])

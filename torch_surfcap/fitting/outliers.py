@@ -16,10 +16,10 @@ from torch_surfcap.fitting.rays import RayBatch
 
 FEWEST = 5  # cameras: among fewer, nobody can say who is wrong
 MOST = 0.15  # share of the cameras that may be wrong
-CELLS = 48  # points along the side of the cube that silhouettes are compared in
+CELLS = 40  # points along the side of the cube that silhouettes are compared in
 CARVED = 0.15  # share of what the others leave that a wrong silhouette takes away ...
 OFTEN = 5.0  # ... and how many times as much as the median camera
-FAR = 3.0  # times the median difference between photograph and rendering
+FAR = 4.0  # times the median difference between photograph and rendering
 DIFFERENCE = 0.02  # of colours: under this a photograph is right whatever the others do
 
 
