@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from torch_surfcap.data.checks import prepare
 from torch_surfcap.fitting import outliers
 
 WRONG = 3  # number of the camera that is spoilt
-SMALL = {"sh_degree": 0, "levels": 2, "voxel": 0.03}
+SMALL: dict[str, Any] = {"sh_degree": 0, "levels": 2, "voxel": 0.03}
 
 
 def turned(capture: Capture, degrees: float) -> Capture:
