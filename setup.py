@@ -27,7 +27,7 @@ GPU_SOURCES = sorted(glob("csrc/cuda/*.cu"))
 HOST = ["-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wno-psabi"]
 ABI = ["-DTORCH_TARGET_VERSION=0x020a000000000000", "-DPy_LIMITED_API=0x030A0000"]  # torch 2.10, Python 3.10
 COMMON = [*(["-O0", "-g"] if DEBUG else ["-O3", "-DNDEBUG"]), *ABI, "-Icsrc"]
-EMULATION = ["-DSURFCAP_CUDA_EMULATION", "-Wno-unknown-pragmas", "-Itests/emulation"]
+EMULATION = ["-O1", "-DSURFCAP_CUDA_EMULATION", "-Wno-unknown-pragmas", "-Itests/emulation"]
 
 
 def gencode(arch: str) -> str:
@@ -69,7 +69,18 @@ class BuildOps(build_ext):
             needs = listing.read_text().replace("\\\n", "").split()[1:] if target.exists() else [""]
             made = target.stat().st_mtime if target.exists() else 0.0
             if self.force or any(not os.path.exists(n) or os.path.getmtime(n) > made for n in needs):
-                command = [*tool, *common, "-MMD", "-MF", str(listing), "-c", source, "-o", str(target)]
+                command = [
+                    tool[0],
+                    *common,
+                    *tool[1:],
+                    "-MMD",
+                    "-MF",
+                    str(listing),
+                    "-c",
+                    source,
+                    "-o",
+                    str(target),
+                ]
                 done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
                 print(*command, f"\n{done.stdout}", end="", flush=True)  # at once: other files are under way
                 if done.returncode:

@@ -50,7 +50,7 @@ def by_silhouettes(capture: Capture) -> dict[int, str]:
     return {
         i: f"its silhouette excludes {share:.0%} of what the others leave of the subject (wrong calibration or moment?)"
         for i, alone in enumerate(carved.tolist())
-        if (share := alone / (alone + hull)) > CARVED and alone > OFTEN * usual
+        if alone > OFTEN * usual and (share := alone / (alone + hull)) > CARVED
     }
 
 
