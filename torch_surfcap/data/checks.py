@@ -33,7 +33,7 @@ def prepare(capture: Capture) -> Capture:
     test = capture.test
     sound = _find_masks(capture)
     faults = _faults(sound)
-    kept = _leave_out(sound, faults)
+    kept = leave_out(sound, faults)
     if len(kept) < FEWEST:
         first = f" ({next(iter(kept.warnings))})" if faults else ""
         raise InputError(
@@ -41,7 +41,7 @@ def prepare(capture: Capture) -> Capture:
         )
     if test is not None:
         test = _find_masks(test, shadows=False)
-        kept_test = _leave_out(test, _faults(test, subject=meeting_point(kept)))
+        kept_test = leave_out(test, _faults(test, subject=meeting_point(kept)))
         kept.warnings += [f"held out: {line}" for line in kept_test.warnings]
         kept_test.prepared = True
         kept.test = kept_test if len(kept_test) else None
@@ -49,7 +49,8 @@ def prepare(capture: Capture) -> Capture:
     return kept
 
 
-def _leave_out(capture: Capture, faults: dict[int, str]) -> Capture:
+def leave_out(capture: Capture, faults: dict[int, str]) -> Capture:
+    """A copy without some cameras, given by number with what is wrong; each is named in its warnings."""
     kept = capture.subset([i for i in range(len(capture)) if i not in faults])
     kept.warnings += [f"camera {capture.names[i]} is left out: {why}" for i, why in faults.items()]
     return kept

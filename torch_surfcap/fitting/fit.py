@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_surfcap import devices, ops
 from torch_surfcap.data.capture import Capture
-from torch_surfcap.data.checks import prepare
+from torch_surfcap.data.checks import leave_out, prepare
 from torch_surfcap.data.floor import find_floor
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
@@ -150,11 +150,9 @@ def _without_contradicting(capture: Capture) -> tuple[Capture, dict[str, str]]:
     found = outliers.by_silhouettes(capture)
     if not found:
         return capture, {}
-    kept = capture.subset([i for i in range(len(capture)) if i not in found])
+    kept = leave_out(capture, found)
     kept.prepared, kept.test = capture.prepared, capture.test
-    left_out = {capture.names[i]: why for i, why in found.items()}
-    kept.warnings += [f"camera {name} is left out: {why}" for name, why in left_out.items()]
-    return kept, left_out
+    return kept, {capture.names[i]: why for i, why in found.items()}
 
 
 @dataclass
