@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from torch_surfcap import rows as processes
 from torch_surfcap.ablation import Row, plan, read_table
 from torch_surfcap.data.sample_scene import make_sample_scene
 from train import ablate
@@ -115,7 +116,7 @@ def test_a_finished_row_is_not_run_again(
         started.append(row.name)
         return {"error": "not run here"}
 
-    monkeypatch.setattr(ablate, "run_row", start)
+    monkeypatch.setattr(processes, "run_row", start)
     assert finished.run() == 1
     assert started == ["far away"]
     started.clear()
@@ -131,7 +132,7 @@ def test_a_row_that_failed_is_run_afresh(finished: Folders, tmp_path: Path) -> N
     folder = tmp_path / "figure" / str(row.key)
     folder.mkdir(parents=True)
     (folder / "mesh.ply").write_text("left by an interrupted fit")
-    assert "the visual hull is empty" in ablate.run_row(row, finished.scene, tmp_path)["error"]
+    assert "the visual hull is empty" in processes.run_row(row, finished.scene, tmp_path)["error"]
     assert sorted(path.name for path in folder.iterdir()) == ["log.txt", "row.json"]
 
 

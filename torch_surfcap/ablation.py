@@ -19,7 +19,7 @@ from torch_surfcap.errors import InputError
 from torch_surfcap.score_table import COLUMNS
 
 PACKAGE = Path(__file__).parent
-NO_PART_OF_A_FIT = {"ablation.py", "score_table.py"}
+NO_PART_OF_A_FIT = {"ablation.py", "chart.py", "chart_figures.py", "rows.py", "score_table.py"}
 
 
 @dataclass
@@ -47,8 +47,9 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One fit: group None is the baseline, changes what it changes of that. arguments: of train/fit.py, but for `out`. key:
-    the same for the same settings of the same program; None, with the error, where this program does not know them."""
+    """One fit: group None is the baseline, changes what it changes of that. script: of train/, that fits; arguments: its own,
+    but for `out`. key: the same for the same settings of the same program; None, with the error, where this program does
+    not know them."""
 
     scene: str
     opacity: str
@@ -58,6 +59,7 @@ class Row:
     arguments: tuple[str, ...]
     key: str | None = None
     error: str = ""
+    script: str = "fit.py"
 
     @property
     def device(self) -> str:

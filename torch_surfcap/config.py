@@ -93,6 +93,10 @@ class DescentConfig:
     visit: str | None = _one_of(None, *VISITS)  # of a ray: its ranges, the cells not empty, or the box
     bundle: int | None = _within(None, 1)  # consecutive rays that share a list of integration ranges
     stop: float | None = _within(None, 0, 1)  # transmittance below which a ray ends
+    fall: float | None = _within(
+        None, 0, 1
+    )  # of the loss in 5 iterations, as its share, that keeps the rates
+    drops: int | None = _within(None, 1)  # of the rates; the last one ends a level
 
 
 @dataclass
@@ -118,7 +122,8 @@ class Config:
     seed: int = _within(0, 0)
     sh_degree: int | None = _one_of(None, 0, 1, 2)  # of the colour's dependence on the direction of view
     view_spacing: int = _one_of(1, *VIEW_SPACINGS)  # voxels between the nodes of view-dependent coefficients
-    voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: a pixel
+    voxel: float | None = _within(None, 1e-9)  # edge of the finest voxels, capture's unit; auto: voxel_pixels
+    voxel_pixels: float = _within(1.0, 0.1, 100)  # the same in footprints of a pixel, where `voxel` is auto
     levels: int | None = _within(None, 1, 12)  # resolutions from coarse to fine
     opacity: str | None = _one_of(None, *LOSSES)  # what a voxel stores
     gains: str = _one_of("auto", *CHOICES["gains"])  # gain and bias per camera
@@ -196,6 +201,7 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "sh_degree": config.sh_degree,
         "view_spacing": config.view_spacing,
         "voxel": config.voxel,
+        "voxel_pixels": config.voxel_pixels,
         "levels": config.levels,
         "gains": config.gains,
         "gain_per": config.gain_per,

@@ -25,6 +25,7 @@ COLUMNS = {
     "pieces": Column("pieces", 0, ".0f"),
     "silhouette_iou": Column("IoU", 1, ".4f"),
     "psnr_volume": Column("PSNR volume, dB", 1, ".2f", difference=True),
+    "psnr_masked": Column("PSNR within the mask, dB", 1, ".2f", difference=True),
     "psnr_raster": Column("PSNR raster, dB", 1, ".2f", difference=True),
     "samples": Column("samples of an iteration, 10⁶", 0, ".2f", unit=1e6),
     "tiles": Column("tiles", 0, ".0f"),

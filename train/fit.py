@@ -203,6 +203,8 @@ def _metrics(
             "torch": torch.__version__,
             "peak_memory_bytes": devices.peak_bytes(device),
         },
+        "views": len(capture),
+        "pixels": float(capture.cameras.size.double().prod(1).mean()),  # of a view
         "voxels": result.field.voxels[..., 0].numel(),
         "tiles": len(result.field.voxels),
         "triangles": len(result.mesh.faces),

@@ -113,7 +113,7 @@ def _fit(
     if saved is not None and checkpoints is not None:
         checkpoints.check(saved, s, capture)
     box = subject_box(capture, s.box) if saved is None else saved.box
-    plan = plan_levels(capture, box, s.voxel, s.levels)
+    plan = plan_levels(capture, box, s.voxel, s.levels, s.voxel_pixels)
     watch.lap("box")
     floor = find_floor(capture, box) if s.floor == "auto" else None
     watch.lap("floor")
@@ -276,12 +276,13 @@ def _chosen(
     so_far: Record,
 ) -> dict[str, Any]:
     """What the fit chose, and why."""
+    footprints = "a pixel's footprint" if s.voxel_pixels == 1 else f"{s.voxel_pixels:g} footprints of a pixel"
     cut = "memory" if outcome.number < len(plan) - 1 else None
     return {
         "sh_degree": {"value": s.degree, "reason": "default" if s.sh_degree is None else "given"},
         "voxel": {
             "value": outcome.grid.voxel_size,
-            "reason": cut or ("a pixel's footprint" if s.voxel is None else "given"),
+            "reason": cut or (footprints if s.voxel is None else "given"),
         },
         "levels": {
             "value": outcome.number + 1,

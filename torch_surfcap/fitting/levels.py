@@ -44,13 +44,18 @@ class Level:
 
 
 def plan_levels(
-    capture: Capture, box: tuple[Tensor, Tensor], voxel: float | None, levels: int | None
+    capture: Capture,
+    box: tuple[Tensor, Tensor],
+    voxel: float | None,
+    levels: int | None,
+    voxel_pixels: float = 1.0,
 ) -> list[Level]:
     """From coarse to fine: voxels halve and pictures double until they have their full size.
 
-    The finest voxel is by default a pixel's footprint at the box's middle (the median over the cameras).
+    The finest voxel is by default ``voxel_pixels`` footprints of a pixel at the box's middle (the median over the cameras).
     """
-    finest = voxel if voxel is not None else pixel_footprint(capture.cameras, (box[0] + box[1]) / 2)
+    footprint = pixel_footprint(capture.cameras, (box[0] + box[1]) / 2)
+    finest = voxel if voxel is not None else voxel_pixels * footprint
     side = int(capture.cameras.size.min())
     if levels is None:
         levels = 1

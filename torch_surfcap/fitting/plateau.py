@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from torch_surfcap.fitting.settings import Descent
+
 
 @dataclass
 class Plateau:
@@ -30,6 +32,12 @@ class Plateau:
     count: int = 0
     top: float = -math.inf
     losses: list[float] = field(default_factory=list)
+
+    @staticmethod
+    def of(limit: int, descent: Descent) -> Plateau:
+        """With the settings' patience; the share of the way since the top moves with the gain."""
+        share = Plateau.share / Plateau.gain * descent.fall
+        return Plateau(limit, gain=descent.fall, share=share, drops=descent.drops)
 
     @property
     def ended(self) -> bool:

@@ -47,6 +47,8 @@ class Descent:
     )
     bundle: int = 1  # consecutive rays (8 x 8 pixels are 64) that share a list of integration ranges
     stop: float = 1e-3  # a ray ends when its transmittance is lower
+    fall: float = 0.02  # share of the loss that five iterations must take off it, else the rates are lowered
+    drops: int = 2  # so many times, the last of which ends the level
 
     def step_of(self, last: bool) -> float:
         """Between samples at the last level or another, voxels."""
@@ -96,7 +98,7 @@ class FitSettings:
     sh_degree: 0, 1, 2, of the colour's dependence on the direction of view
     view_spacing: voxels between the nodes that the view-dependent coefficients stand at: 1, in every voxel; 4 or 8, on a
                coarser grid that is read once per ray (see ``torch_surfcap.fitting.view_color``)
-    voxel:     edge of the finest voxels, world units; a pixel's footprint by default
+    voxel:     edge of the finest voxels, world units; by default `voxel_pixels` footprints of a pixel
     levels:    number of resolutions; by default as many, up to 4, as the pictures can be halved
     box:       (x0, y0, z0, x1, y1, z1) around the subject; found by default
     gains:     "auto", "on", "off": gain and bias per camera; auto is on: it costs 0.1 dB where cameras are equal, and
@@ -127,6 +129,7 @@ class FitSettings:
     sh_degree: int | None = None
     view_spacing: int = 1
     voxel: float | None = None
+    voxel_pixels: float = 1.0
     levels: int | None = None
     box: tuple[float, ...] | None = None
     gains: str = "auto"
@@ -190,6 +193,7 @@ class FitSettings:
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
             ("view_spacing", settings.view_spacing in VIEW_SPACINGS),
             ("voxel", settings.voxel is None or settings.voxel > 0),
+            ("voxel_pixels", settings.voxel_pixels > 0),
             ("storage", settings.storage in (32, 16, 8)),
             ("rounding", settings.rounding in ("stochastic", "nearest")),
             ("accumulator", settings.accumulator in ((32, 16) if may_halve else (32,))),

@@ -183,10 +183,9 @@ def begin_stage(
     rays = gather_rays(capture, store, grid, settings.opacity, march, descent.bundle, descent.visit)
     rays.expose(capture, studio.backdrop, studio.exposure)
     adam = begin_adam(store, settings)
+    rule = Plateau.of(3 * level.iterations, descent)
     view = begin_view_color(settings, grid, floats, rays, march, view)
-    return Stage(
-        number, level, grid, store, march, rays, adam, Plateau(limit=3 * level.iterations), view=view
-    )
+    return Stage(number, level, grid, store, march, rays, adam, rule, view=view)
 
 
 def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: Floor | None = None) -> Studio:
