@@ -47,7 +47,7 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One fit: group None is the baseline, changes what it changes of that. script: of train/, that fits; arguments: its own,
+    """One fit: group None is the baseline, changes what it changes of that. script: of train/, that fits; arguments: of it,
     but for `out`. key: the same for the same settings of the same program; None, with the error, where this program does
     not know them."""
 

@@ -22,7 +22,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -73,8 +73,11 @@ def main(arguments: Sequence[str] | None = None, started: float = 0.0) -> int:
     return 0
 
 
-def run(config: Config, started: float = 0.0) -> None:
-    """Load, fit, score and write. Raises InputError before any work where the results could not be written."""
+def run(config: Config, started: float = 0.0, method: Callable[..., FitResult] = fit) -> None:
+    """Load, fit, score and write. Raises InputError before any work where the results could not be written.
+
+    method: another one to fit by, with the arguments of :func:`torch_surfcap.fit`.
+    """
     start = time.perf_counter()
     out = Path(config.out)
     if not config.data.path:
@@ -87,7 +90,7 @@ def run(config: Config, started: float = 0.0) -> None:
     with closing(Bars(device)) as bars:
         label = settings.to_yaml(config)
         checkpoints = Checkpoints(out / CHECKPOINT, config.checkpoint, config.resume, label)
-        result = fit(capture, bars, checkpoints, device=str(device), **settings.fit_arguments(config))
+        result = method(capture, bars, checkpoints, device=str(device), **settings.fit_arguments(config))
     for warning in result.warnings[len(capture.warnings) :]:
         print(f"warning: {warning}")
     seconds |= result.seconds
