@@ -19,7 +19,14 @@ from torch_surfcap.errors import InputError
 from torch_surfcap.score_table import COLUMNS
 
 PACKAGE = Path(__file__).parent
-NO_PART_OF_A_FIT = {"ablation.py", "chart.py", "chart_figures.py", "rows.py", "score_table.py"}
+NO_PART_OF_A_FIT = {
+    "ablation.py",
+    "chart.py",
+    "chart_figures.py",
+    "chart_page.py",
+    "rows.py",
+    "score_table.py",
+}
 
 
 @dataclass
@@ -48,8 +55,8 @@ class Table:
 @dataclass(frozen=True, eq=False)
 class Row:
     """One fit: group None is the baseline, changes what it changes of that. script: of train/, that fits; arguments: of it,
-    but for `out`. key: the same for the same settings of the same program; None, with the error, where this program does
-    not know them."""
+    but for `out`; scored: more of train/evaluate.py's. key: the same for the same settings of the same program; None, with
+    the error, where this program does not know them."""
 
     scene: str
     opacity: str
@@ -60,6 +67,7 @@ class Row:
     key: str | None = None
     error: str = ""
     script: str = "fit.py"
+    scored: tuple[str, ...] = ()
 
     @property
     def device(self) -> str:

@@ -64,11 +64,17 @@ def run_row(row: Row, capture: Path, out: Path) -> dict[str, Any]:
             "evaluate.py",
             f"--run={folder}",
             f"--device={row.device}",
+            *row.scored,
             *(f"{flag}={path}" for flag, path in truths),
         ],
     )
     # On Linux a child's peak memory begins at its parent's: this process loads nothing that a fit does not.
-    environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "PYTHONUNBUFFERED": "1"}
+    pages = os.environ.get("THP_MEM_ALLOC_ENABLE", "1")  # as train/fit.py has it, for every script
+    environment = os.environ | {
+        "PYTHONPATH": str(PACKAGE.parent),
+        "PYTHONUNBUFFERED": "1",
+        "THP_MEM_ALLOC_ENABLE": pages,
+    }
     log = folder / "log.txt"
     result: dict[str, Any] = {"settings": row.arguments, "program": program_digest()}
     spent = []

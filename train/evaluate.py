@@ -92,7 +92,7 @@ def _score(run: Path, scan: dtu.Scan | None, options: argparse.Namespace) -> dic
     """The results of one run, as evaluation.json gets them."""
     start = time.perf_counter()
     config, field, mesh = read_run(run, options.device)
-    capture = _capture(config, options.protocol)
+    capture = _capture(config, options.protocol, options.scale)
     truth = None if options.mesh_truth is None else read_mesh(Path(options.mesh_truth))
     points = None if options.points_truth is None else read_points(Path(options.points_truth))
     concave = _concave(options)
@@ -157,9 +157,11 @@ def _concave(options: argparse.Namespace) -> Points | None:
     return read_points(beside) if beside is not None and beside.is_file() else None
 
 
-def _capture(config: settings.Config, protocol: str) -> Capture:
+def _capture(config: settings.Config, protocol: str, scale: float | None = None) -> Capture:
     """The run's views as the protocol reads them, with a line for each that is left out."""
     arguments = settings.capture_arguments(config)
+    if scale is not None:
+        arguments["scale"] = scale
     if protocol != "default":
         arguments |= {"scale": 1.0, "masks": True, "plates": False}
     if protocol == "nerf":
@@ -205,6 +207,12 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--cut", type=float, default=0.05, help="longest distance that counts, world units")
     parser.add_argument("--protocol", choices=list(table.COLUMNS), default="default")
+    parser.add_argument(
+        "--scale",
+        type=float,
+        metavar="FRACTION",
+        help="size of the pictures scored; by default that of the fit's",
+    )
     parser.add_argument(
         "--train", action="store_true", help="score the views of the fit as well; dtu always does"
     )
