@@ -112,7 +112,18 @@ def test_history_has_a_row_per_iteration(finished: Path) -> None:
 def test_metrics(finished: Path) -> None:
     metrics = json.loads((finished / "metrics.json").read_text())
     assert list(metrics) == [
-        *("train", "test", "seconds", "peak_memory_bytes", "device", "voxels", "tiles", "triangles"),
+        *(
+            "train",
+            "test",
+            "seconds",
+            "peak_memory_bytes",
+            "device",
+            "views",
+            "pixels",
+            "voxels",
+            "tiles",
+            "triangles",
+        ),
         *("chosen", "warnings", "resumed_from", "iterations_run"),
     ]
     for split, views in (("train", 8), ("test", TEST_VIEWS)):

@@ -140,7 +140,9 @@ def rivals(rows: Sequence[tuple[Row, str]], options: argparse.Namespace) -> list
         seconds = read_result(row, options.out).get("scores", {}).get("seconds")
         if group != PRESETS or row.name != STANDARD or seconds is None:
             continue
-        given = {"soft hull alone": ("--method=hull",)} if "hull" in options.rivals else {}
+        given: dict[str, tuple[str, ...]] = {}
+        if "hull" in options.rivals:
+            given["soft hull alone"] = ("--method=hull",)
         if "autograd" in options.rivals:
             for times in options.rival_times:
                 name = "torch autograd" + f", {times:g} times the seconds" * (times != 1)
