@@ -74,6 +74,20 @@ def figure_colors(points: NDArray[np.float64], seed: int) -> Array:
     return np.clip(albedo * (0.55 + 0.9 * mottle[:, None]), 0.02, 0.98).astype(np.float32)
 
 
+def plain_colors(points: NDArray[np.float64], seed: int) -> Array:
+    """[P,3] one grey, without any texture."""
+    return np.full((len(points), 3), 0.55, np.float32)
+
+
+def repeated_colors(points: NDArray[np.float64], seed: int) -> Array:
+    """[P,3] a chequer of 6 cm that looks the same wherever it is seen."""
+    chequer = np.sin(np.pi * (points + 0.011) / 0.06).prod(axis=1) > 0
+    return np.where(chequer[:, None], (0.75, 0.70, 0.55), (0.25, 0.30, 0.45)).astype(np.float32)
+
+
+PAINTS = {"cloth": figure_colors, "plain": plain_colors, "repeated": repeated_colors}
+
+
 def room_colors(origins: NDArray[np.float64], directions: NDArray[np.float64], seed: int) -> Array:
     """[P,3] colours in [0, 1] of the empty room along rays from inside of it."""
     low, high = np.array([-ROOM[0], -ROOM[1], 0.0]), np.array(ROOM)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.data.load import in_threads
-from torch_surfcap.data.sample_figure import figure_colors, figure_mesh, room_colors
+from torch_surfcap.data.sample_figure import PAINTS, figure_mesh, room_colors
 from torch_surfcap.errors import InputError
 
 Array = NDArray[np.float64]
@@ -51,12 +51,17 @@ SUPERSAMPLES = 2  # per pixel and axis
 @dataclass(frozen=True)
 class Coat:
     """What lies over the figure's matte colours: white highlights of the lamps, of this strength (0: none), by Blinn and
-    Phong with the exponent 2/roughness^4 - 2."""
+    Phong with the exponent 2/roughness^4 - 2. paint: the matte colours, "cloth", "plain" (one grey) or "repeated" (the same
+    few centimetres everywhere). mirror: heights (from, to) in metres between which it reflects the room instead."""
 
     gloss: float = 0.0
     roughness: float = 0.5
+    paint: str = "cloth"
+    mirror: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        if self.paint not in PAINTS:
+            raise InputError(f"coat: found paint {self.paint}, expected one of {', '.join(PAINTS)}")
         if not (0 <= self.gloss <= 10 and 0.05 <= self.roughness <= 1):
             raise InputError(
                 f"coat: found gloss {self.gloss} and roughness {self.roughness}, expected 0 to 10 and 0.05 to 1"
@@ -78,7 +83,7 @@ def make_sample_scene(
     """
     folder = Path(folder)
     coat = coat or Coat()
-    parameters: dict[str, float] = {
+    parameters: dict[str, Any] = {
         "version": VERSION,
         "views": views,
         "test_views": test_views,
@@ -87,7 +92,7 @@ def make_sample_scene(
         **asdict(coat),
     }
     last = folder / "transforms_train.json"  # written last: its presence says that all is there
-    if _parameters(last) == parameters:
+    if _parameters(last) == json.loads(json.dumps(parameters)):
         return folder
     try:
         last.unlink(missing_ok=True)
@@ -181,7 +186,13 @@ def _shaded(
         halfway = lamp - directions
         halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
         highlight += strength * np.clip((normals * halfway).sum(axis=1), 0, 1) ** (2 / coat.roughness**4 - 2)
-    colors = figure_colors(points, seed) * light[:, None] + coat.gloss * highlight[:, None]
+    colors = PAINTS[coat.paint](points, seed) * light[:, None] + coat.gloss * highlight[:, None]
+    if coat.mirror is not None:
+        low, high = coat.mirror
+        patch = (points[:, 2] > low) & (points[:, 2] < high)
+        slope = (normals * directions).sum(axis=1, keepdims=True)
+        reflected = (directions - 2 * slope * normals)[patch]
+        colors[patch] = room_colors(points[patch], reflected, seed)
     return np.clip(colors, 0, 1)
 
 
@@ -200,7 +211,7 @@ def _names(split: str, i: int) -> tuple[str, str, str]:
     return f"{split}/{i:03d}.png", f"mask/{split}_{i:03d}.png", f"background/{split}_{i:03d}.png"
 
 
-def _write_transforms(path: Path, cameras: Cameras, split: str, parameters: dict[str, float]) -> None:
+def _write_transforms(path: Path, cameras: Cameras, split: str, parameters: dict[str, Any]) -> None:
     to_world = camtoworld_vision_to_graphics_4x4(torch.linalg.inv(cameras.world_to_camera))
     K, size = cameras.K[0], cameras.size[0]
     frames = []
