@@ -92,7 +92,7 @@ def run_one(scene: str, condition: Condition, options: argparse.Namespace) -> di
     shutil.rmtree(folder, ignore_errors=True)  # what an interrupted run has left
     folder.mkdir(parents=True)
     command = [sys.executable, str(Path(__file__).resolve()), f"--out={options.out}", f"--scenes={scene}"]
-    command += [f"--trial={condition.group}/{condition.title}"]
+    command += [f"--trial={condition.group}/{condition.title}", f"--folder={folder}"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with (folder / "log.txt").open("w", encoding="utf-8") as log:
         child = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
@@ -132,9 +132,9 @@ def _trial(options: argparse.Namespace, condition: Condition) -> int:
     clean: trimesh.Trimesh | None = (
         read_mesh(path) if condition.expected == "same" and path.is_file() else None
     )
-    folder, cache = _folder(scene, condition, options.out), options.out / "scenes"
-    result = run_trial(_scene(scene), condition, cache, folder, clean, _examine)
-    report.write_json(folder / "trial.json", result)
+    cache = options.out / "scenes"
+    result = run_trial(_scene(scene), condition, cache, options.folder, clean, _examine)
+    report.write_json(options.folder / "trial.json", result)
     return 0
 
 
@@ -191,6 +191,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--limit", type=float, default=180.0, help="of one run, seconds: beyond it hangs")
     parser.add_argument("--page", type=Path, default=PAGE, metavar="MD", help="with marks for the tables")
     parser.add_argument("--trial", default="", help=argparse.SUPPRESS)  # one run, in this process
+    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)  # of that run
     return parser.parse_args(arguments)
 
 

@@ -162,13 +162,14 @@ def write_heat_map(path: Path, results: Results) -> None:
     from matplotlib.figure import Figure
 
     scenes = list(dict.fromkeys(scene for scene, _ in results))
-    conditions = [c for c in dict.fromkeys(condition for _, condition in results) if c != CLEAN]
+    conditions = list(dict.fromkeys(condition for _, condition in results))
     columns = [(scene, name) for scene in scenes for name in ("chamfer", "concave")]
     values = np.array([[ratio(results, scene, c, name) for scene, name in columns] for c in conditions])
     half = (len(conditions) + 1) // 2
     figure = Figure(figsize=(5 + 2.2 * len(scenes), 1.2 + 0.2 * half), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, part in zip(figure.subplots(1, 2), (slice(0, half), slice(half, None)), strict=True):
+    panels = [part for part in (slice(0, half), slice(half, None)) if conditions[part]]
+    for axes, part in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         shown = values[part].reshape(-1, len(columns))
         image = axes.imshow(shown, cmap="RdYlGn_r", norm=LogNorm(1 / WORST, WORST), aspect="auto")
         for row, condition in enumerate(conditions[part]):

@@ -41,10 +41,10 @@ SHADE = 0.6  # brightness of what lies in it
 class Scene:
     """What is photographed, and from where.
 
-    subject: one of SUBJECTS. depth: of the bowl, metres. wires: their width in voxels, 0: none. fringe: hairs all over. second: a ball beside it.
-    sunk: it stands in the floor, flat below. shadow: it throws one, and the masks hold it. moment: camera WRONG saw it
-    turned by 40 degrees. rig: "ring"; "mixed": distances, focal lengths and sizes that differ several times; "inside": one
-    camera stands within the subject's box. size: of the square pictures, pixels.
+    subject: one of SUBJECTS. depth: of the bowl, metres. wires: their width in voxels, 0: none. fringe: hairs all over.
+    second: a ball beside it. sunk: it stands in the floor, flat below. shadow: it throws one, and the masks hold it.
+    moment: camera WRONG saw it turned by 40 degrees. rig: "ring"; "mixed": distances, focal lengths and sizes that differ
+    several times; "inside": one camera stands within the subject's box. size: of the square pictures, pixels.
     """
 
     subject: str = "figure"
@@ -112,9 +112,12 @@ def photographed(scene: Scene) -> Capture:
 
 
 def _taken(scene: Scene, mesh: trimesh.Trimesh, cameras: Cameras) -> Capture:
-    turned = mesh.copy()
-    turned.apply_transform(trimesh.transformations.rotation_matrix(np.radians(40), (0, 0, 1)))
-    shadow = _shadow(mesh) if scene.shadow else None
+    turned, shadow = mesh, None
+    if scene.moment:
+        turned = mesh.copy()
+        turned.apply_transform(trimesh.transformations.rotation_matrix(np.radians(40), (0, 0, 1)))
+    if scene.shadow:
+        shadow = _shadow(mesh)
     for shared in (mesh, turned, shadow):
         _ = shared is not None and (
             shared.vertex_normals,
@@ -168,8 +171,11 @@ def _subject(name: str, depth: float) -> trimesh.Trimesh:
 def _bowl(depth: float) -> trimesh.Trimesh:
     """A hollow ball cut open, on a foot that reaches the floor; `depth` goes from the opening to the bottom, metres."""
     center, outer, inner = np.array(BOWL[0]), BOWL[1], BOWL[2]
-    low, high = center - outer - 0.03, center + outer + 0.03
-    low[2] = -0.03
+    margin = (
+        0.0337  # no plane of the lattice lies in one of the bowl's, where marching cubes would leave holes
+    )
+    low, high = center - outer - margin, center + outer + margin
+    low[2] = -margin
     axes = [np.arange(a, b, SPACING) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - center
     radius = np.linalg.norm(points, axis=-1)
