@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import signal
+import subprocess
+import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -320,3 +324,16 @@ def test_the_command_goes_on_where_it_was(
     assert "| gain ±20% | figure | 1.1× | 1.00× (2.00 mm) | 1.00× (3.00 mm) |" in printed
     assert stress.main([*words, "--groups=photometri"]) == 2
     assert "expected some of subject" in capsys.readouterr().err
+
+
+def test_a_stopped_process_does_not_hang() -> None:
+    sleeper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1)"])
+    sleeper.send_signal(signal.SIGSTOP)
+    waker = threading.Timer(2.0, sleeper.send_signal, [signal.SIGCONT])
+    waker.start()
+    assert stress._wait(sleeper, 1.8) == 0
+    waker.join()
+    endless = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    assert stress._wait(endless, 0.3) is None
+    endless.kill()
+    assert stress._wait(endless, 5.0) == -signal.SIGKILL

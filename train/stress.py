@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
 import trimesh
 
 from torch_surfcap import report
@@ -97,9 +98,7 @@ def run_one(scene: str, condition: Condition, options: argparse.Namespace) -> di
     with (folder / "log.txt").open("w", encoding="utf-8") as log:
         child = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
         try:
-            status: int | None = child.wait(options.limit)
-        except subprocess.TimeoutExpired:
-            status = None
+            status = _wait(child, options.limit)
         finally:
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
@@ -115,6 +114,21 @@ def run_one(scene: str, condition: Condition, options: argparse.Namespace) -> di
     result |= {"status": status, "group": condition.group, "condition": condition.title, "scene": scene}
     report.write_json(folder / "run.json", result)
     return result
+
+
+def _wait(child: subprocess.Popen[bytes], limit: float) -> int | None:
+    """Exit status, None after `limit` seconds; those in which a process of ours was stopped from outside do not count."""
+    spent, step = 0.0, min(0.5, limit)
+    while spent < limit:
+        begin = time.monotonic()
+        try:
+            return child.wait(step)
+        except subprocess.TimeoutExpired:
+            if psutil.Process(child.pid).status() != psutil.STATUS_STOPPED:
+                spent += min(
+                    time.monotonic() - begin, 2 * step
+                )  # it takes longer where this process was stopped
+    return None
 
 
 def read_result(scene: str, condition: Condition, out: Path) -> dict[str, Any]:
