@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from torch_surfcap import rows as processes
-from torch_surfcap.ablation import Row, plan, read_table
 from torch_surfcap.data.sample_scene import make_sample_scene
+from torch_surfcap.studies import rows as processes
+from torch_surfcap.studies.ablation import Row, plan, read_table
 from train import ablate
 
 ROWS = """

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from torch_surfcap import ablation
-from torch_surfcap.ablation import Group, Scene, Table, plan, read_table
 from torch_surfcap.errors import InputError
+from torch_surfcap.studies import ablation
+from torch_surfcap.studies.ablation import Group, Scene, Table, plan, read_table
 from train.ablate import TABLE
 
 TERMS = Group("Terms", {"no mask loss": "losses.mask=0", "B = 1": "sh_degree=1"})

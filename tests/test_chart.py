@@ -12,10 +12,7 @@ import pytest
 import torch
 
 from tests.fitting.stages import begun
-from torch_surfcap import chart, chart_figures, chart_page, ops
-from torch_surfcap import rows as processes
-from torch_surfcap.ablation import Row, read_table
-from torch_surfcap.chart import BEGIN, END, PRESETS, RIVALS, Mark, Published
+from torch_surfcap import ops
 from torch_surfcap.data.capture import load_capture
 from torch_surfcap.data.checks import prepare
 from torch_surfcap.data.sample_scene import make_sample_scene
@@ -24,6 +21,10 @@ from torch_surfcap.field.field import MISSING
 from torch_surfcap.fitting.descent import RAY_ARGUMENTS
 from torch_surfcap.fitting.plateau import Plateau
 from torch_surfcap.fitting.settings import Descent
+from torch_surfcap.studies import chart, chart_figures, chart_page
+from torch_surfcap.studies import rows as processes
+from torch_surfcap.studies.ablation import Row, read_table
+from torch_surfcap.studies.chart import BEGIN, END, PRESETS, RIVALS, Mark, Published
 from train import chart as command
 from train import rivals
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch_surfcap.score_table import Line, markdown
+from torch_surfcap.studies.score_table import Line, markdown
 
 BASE = Line(
     "baseline", "", {"chamfer": 0.0012, "psnr_volume": 30.0, "pieces": 1, "seconds": 9.6}, baseline=True

@@ -13,9 +13,9 @@ from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import meeting_point
 from torch_surfcap.data.sample_scene import Coat
 from torch_surfcap.errors import InputError
-from torch_surfcap.stress import calibration, capture, numbers, page, photometry, silhouettes, suite
-from torch_surfcap.stress.condition import Condition
-from torch_surfcap.stress.scene import WRONG, Scene, photographed, true_surface
+from torch_surfcap.studies.stress import calibration, capture, numbers, page, photometry, silhouettes, suite
+from torch_surfcap.studies.stress.condition import Condition
+from torch_surfcap.studies.stress.scene import WRONG, Scene, photographed, true_surface
 
 TINY = Scene(views=10, test_views=2, size=64)
 CONDITIONS = suite.all_conditions()

@@ -16,8 +16,8 @@ import pytest
 import trimesh
 
 from tests.test_stress import TINY, condition
-from torch_surfcap.stress import page, suite
-from torch_surfcap.stress.trial import run_trial
+from torch_surfcap.studies.stress import page, suite
+from torch_surfcap.studies.stress.trial import run_trial
 from train import stress
 
 QUICK: dict[str, Any] = {"levels": 2, "sh_degree": 0}

@@ -24,11 +24,11 @@ from pathlib import Path
 import torch
 
 from torch_surfcap import report
-from torch_surfcap.ablation import Row, Scene, Table, plan, program_digest, read_table
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
-from torch_surfcap.rows import Results, read_result, run
-from torch_surfcap.score_table import COLUMNS, Line, markdown
+from torch_surfcap.studies.ablation import Row, Scene, Table, plan, program_digest, read_table
+from torch_surfcap.studies.rows import Results, read_result, run
+from torch_surfcap.studies.score_table import COLUMNS, Line, markdown
 
 TABLE = Path(__file__).resolve().parents[1] / "configs" / "ablation" / "table.yaml"
 APART = {"psnr_masked", "samples", "tiles", "iterations"}  # columns for groups with a table of their own

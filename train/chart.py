@@ -25,14 +25,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from torch_surfcap import chart, report
 from torch_surfcap import config as settings
-from torch_surfcap.ablation import Group, Row, Scene, Table, plan, read_table
-from torch_surfcap.chart import PRESETS, RIVALS, Mark
-from torch_surfcap.chart_page import COLUMNS, content, score_tables
+from torch_surfcap import report
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
-from torch_surfcap.rows import ROOT, read_result, run
+from torch_surfcap.studies import chart
+from torch_surfcap.studies.ablation import Group, Row, Scene, Table, plan, read_table
+from torch_surfcap.studies.chart import PRESETS, RIVALS, Mark
+from torch_surfcap.studies.chart_page import COLUMNS, content, score_tables
+from torch_surfcap.studies.rows import ROOT, read_result, run
 
 SWEEP = ROOT / "configs" / "chart" / "sweep.yaml"
 PUBLISHED = ROOT / "docs" / "published.csv"
@@ -161,7 +162,7 @@ def draw(
     units: Mapping[str, float | None],
 ) -> None:
     """The three pictures."""
-    from torch_surfcap import (
+    from torch_surfcap.studies import (
         chart_figures,  # after the rows: their peak memory begins at that of this process
     )
 

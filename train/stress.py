@@ -2,10 +2,10 @@
 
     python train/stress.py --out OUT [--scenes figure,bowl] [--groups NAME,...] [--only TEXT] [--minutes 60] [--page MD]
 
-Every condition (torch_surfcap/stress/) on every scene is a process of its own with a limit of time: a crash and a hang are
-results like any other. A run lies in OUT/SCENE/KEY, KEY standing for the condition and the program: a finished one is not
-run again, and a command that was stopped or ran out of its minutes goes on where it was. Scenes are made on the way. Writes
-OUT/stability.csv, and table, bounds and heat map between the marks of the page, the picture beside it.
+Every condition (torch_surfcap/studies/stress) on every scene is a process of its own with a limit of time: a crash or a
+hang is a result like any other. A run lies in OUT/SCENE/KEY, KEY standing for the condition and the program: a finished one
+is not run again, and a command that was stopped or ran out of its minutes goes on where it was. Scenes are made on the way.
+Writes OUT/stability.csv, and table, bounds and heat map between the marks of the page, the picture beside it.
 
 Exit 0: nothing crashed, hung or ended in silence without a surface. 1: something did. 2: bad input. 130: interrupted.
 """
@@ -31,11 +31,11 @@ from torch_surfcap import report
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.geometry import read_mesh
 from torch_surfcap.errors import InputError
-from torch_surfcap.stress import page
-from torch_surfcap.stress.condition import Condition
-from torch_surfcap.stress.scene import SUBJECTS, Scene
-from torch_surfcap.stress.suite import CLEAN, GROUPS, all_conditions
-from torch_surfcap.stress.trial import key_of, run_trial
+from torch_surfcap.studies.stress import page
+from torch_surfcap.studies.stress.condition import Condition
+from torch_surfcap.studies.stress.scene import SUBJECTS, Scene
+from torch_surfcap.studies.stress.suite import CLEAN, GROUPS, all_conditions
+from torch_surfcap.studies.stress.trial import key_of, run_trial
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = Path("docs/stability.md")

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from torch_surfcap.data.capture import Capture
-from torch_surfcap.stress.condition import Array, Condition, copied, retouched
-from torch_surfcap.stress.scene import WRONG
+from torch_surfcap.studies.stress.condition import Array, Condition, copied, retouched
+from torch_surfcap.studies.stress.scene import WRONG
 
 GROUP = "photometry"
 

@@ -18,7 +18,6 @@ import trimesh
 from torch import Tensor
 
 from torch_surfcap import report, soundness
-from torch_surfcap.ablation import PACKAGE, program_digest
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import prepare
@@ -29,8 +28,9 @@ from torch_surfcap.errors import InputError
 from torch_surfcap.field.hull import find_box
 from torch_surfcap.fitting.fit import fit
 from torch_surfcap.metrics import surface_scores
-from torch_surfcap.stress.condition import Condition
-from torch_surfcap.stress.scene import Scene, photographed, true_surface
+from torch_surfcap.studies.ablation import program_digest
+from torch_surfcap.studies.stress.condition import Condition
+from torch_surfcap.studies.stress.scene import Scene, photographed, true_surface
 
 SAMPLES = 50_000  # of a surface
 CUT = 0.05  # longest distance that counts, metres
@@ -41,7 +41,7 @@ Examine = Callable[[Capture], Sequence[str]]  # what train/check.py finds
 
 def key_of(scene: Scene, condition: Condition) -> str:
     """Of a run: changes with the program, the scene and the condition."""
-    files = sorted(f for f in (PACKAGE / "stress").glob("*.py") if f.name not in NO_PART_OF_A_TRIAL)
+    files = sorted(f for f in Path(__file__).parent.glob("*.py") if f.name not in NO_PART_OF_A_TRIAL)
     sources = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
     return _digest([program_digest(), sources, asdict(scene), condition.group, condition.title])
 

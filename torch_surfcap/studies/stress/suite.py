@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from torch_surfcap.stress import calibration, capture, numbers, photometry, silhouettes, subject
-from torch_surfcap.stress.condition import Condition
+from torch_surfcap.studies.stress import calibration, capture, numbers, photometry, silhouettes, subject
+from torch_surfcap.studies.stress.condition import Condition
 
 GROUPS = (subject, capture, photometry, calibration, silhouettes, numbers)
 CLEAN = Condition("", "clean", "", "The scene as it is.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from torch_surfcap.data.sample_scene import Coat
-from torch_surfcap.stress.condition import Condition
+from torch_surfcap.studies.stress.condition import Condition
 
 GROUP = "subject"
 

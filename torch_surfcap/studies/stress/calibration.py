@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import meeting_point
-from torch_surfcap.stress.condition import Condition, copied, with_cameras
-from torch_surfcap.stress.scene import WRONG
+from torch_surfcap.studies.stress.condition import Condition, copied, with_cameras
+from torch_surfcap.studies.stress.scene import WRONG
 
 GROUP = "calibration"
 PIXELS = (0.25, 1.0, 4.0)

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from torch_surfcap import report
-from torch_surfcap.ablation import PACKAGE, Row, program_digest
-from torch_surfcap.score_table import COLUMNS
+from torch_surfcap.studies.ablation import PACKAGE, Row, program_digest
+from torch_surfcap.studies.score_table import COLUMNS
 
 ROOT = PACKAGE.parent
 TRUTHS = {"--mesh-truth": "gt.ply", "--points-truth": "gt_visible.npz", "--concave": "concave.npz"}

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from torch_surfcap.chart import (
+from torch_surfcap.data.files import atomic_write
+from torch_surfcap.report import DPI
+from torch_surfcap.studies.chart import (
     AXES,
     COSTS,
     GROWTH,
@@ -24,8 +26,6 @@ from torch_surfcap.chart import (
     front,
     growth,
 )
-from torch_surfcap.data.files import atomic_write
-from torch_surfcap.report import DPI
 
 SUFFIXES = (".png", ".svg")
 AREA = 60.0  # of a mark of 1 GiB, points²

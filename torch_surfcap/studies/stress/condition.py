@@ -13,7 +13,7 @@ from torch import Tensor
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.images import as_float
-from torch_surfcap.stress.scene import Scene
+from torch_surfcap.studies.stress.scene import Scene
 
 Array = np.ndarray  # of floats
 

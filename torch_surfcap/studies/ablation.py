@@ -16,18 +16,10 @@ from yaml import YAMLError
 
 from torch_surfcap import config as settings
 from torch_surfcap.errors import InputError
-from torch_surfcap.score_table import COLUMNS
+from torch_surfcap.studies.score_table import COLUMNS
 
-PACKAGE = Path(__file__).parent
-NO_PART_OF_A_FIT = {
-    "ablation.py",
-    "chart.py",
-    "chart_figures.py",
-    "chart_page.py",
-    "rows.py",
-    "score_table.py",
-    "stress",
-}  # files and folders
+PACKAGE = Path(__file__).resolve().parents[1]
+STUDIES = Path(__file__).resolve().parent  # no part of a fit
 
 
 @dataclass
@@ -141,7 +133,7 @@ def _chosen(table: Table, scene: str, names: Sequence[str]) -> Iterator[tuple[st
 def program_digest() -> str:
     """Stands for the program that fits: the package's Python and its compiled library."""
     files = sorted([*PACKAGE.rglob("*.py"), *PACKAGE.glob("_C*.so")])
-    parts = [file for file in files if not NO_PART_OF_A_FIT & {file.name, file.parent.name}]
+    parts = [file for file in files if not file.is_relative_to(STUDIES)]
     return _digest([[file.name, hashlib.sha256(file.read_bytes()).hexdigest()] for file in parts])
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
-from torch_surfcap.stress.condition import Condition, with_cameras
+from torch_surfcap.studies.stress.condition import Condition, with_cameras
 
 GROUP = "numbers"
 

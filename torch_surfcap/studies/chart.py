@@ -8,10 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torch_surfcap.ablation import Row
 from torch_surfcap.data.parse import read_json
 from torch_surfcap.errors import InputError
-from torch_surfcap.rows import folder_of, read_result
+from torch_surfcap.studies.ablation import Row
+from torch_surfcap.studies.rows import folder_of, read_result
 
 BEGIN, END = (
     "<!-- chart: begin -->",

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from torch_surfcap.ablation import program_digest
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
-from torch_surfcap.stress.condition import Condition
-from torch_surfcap.stress.suite import CLEAN
+from torch_surfcap.studies.ablation import program_digest
+from torch_surfcap.studies.stress.condition import Condition
+from torch_surfcap.studies.stress.suite import CLEAN
 
 Results = Mapping[
     tuple[str, Condition], dict[str, Any]

@@ -11,8 +11,8 @@ from pathlib import Path
 import psutil
 import torch
 
-from torch_surfcap.ablation import PACKAGE, program_digest
-from torch_surfcap.chart import (
+from torch_surfcap.studies.ablation import PACKAGE, program_digest
+from torch_surfcap.studies.chart import (
     LARGE,
     LEFT,
     Mark,
@@ -22,7 +22,7 @@ from torch_surfcap.chart import (
     published_table,
     work_table,
 )
-from torch_surfcap.score_table import Line, markdown
+from torch_surfcap.studies.score_table import Line, markdown
 
 COLUMNS = ["chamfer", "normal_error_deg", "concave", "pieces", "psnr_masked", "psnr_volume", "psnr_raster"]
 COLUMNS += ["seconds", "cpu_seconds", "memory"]

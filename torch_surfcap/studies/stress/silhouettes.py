@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from torch_surfcap.data.capture import Capture
-from torch_surfcap.stress.condition import Array, Condition, copied, eight_bits
+from torch_surfcap.studies.stress.condition import Array, Condition, copied, eight_bits
 
 GROUP = "silhouettes"
 HOLE = 0.04  # radius of a hole, of the picture's width

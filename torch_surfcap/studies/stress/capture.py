@@ -8,7 +8,7 @@ import torch
 
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
-from torch_surfcap.stress.condition import Condition, copied
+from torch_surfcap.studies.stress.condition import Condition, copied
 
 GROUP = "capture"
 
