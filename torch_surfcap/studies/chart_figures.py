@@ -45,7 +45,7 @@ def write_accuracy(
     a line through the front of ours, hollow marks for what is published. millimetres: of each scene's unit of length."""
     scenes = list(dict.fromkeys(mark.scene for mark in marks if mark.scores))
     figure, panels = _figure(len(scenes), 2)
-    for scene, (left, right) in zip(scenes, panels, strict=True):
+    for scene, (left, right) in zip(scenes, panels, strict=False):  # a figure without panels is none
         here = [mark for mark in marks if mark.scene == scene and "seconds" in mark.scores]
         unit = millimetres.get(scene)
         _accuracy(left, here, "chamfer", unit or 1.0)
