@@ -49,11 +49,12 @@ def test_the_same_settings_have_the_same_key(tmp_path: Path) -> None:
 
 def test_another_program_is_another_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "package"
-    (folder / "deep").mkdir(parents=True)
+    for name in ("deep", "studies"):
+        (folder / name).mkdir(parents=True)
     (folder / "deep" / "a.py").write_text("x = 1\n")
     monkeypatch.setattr(ablation, "PACKAGE", folder)
     keys = []
-    for name in ("deep/a.py", "_C.abi3.so", "score_table.py"):
+    for name in ("deep/a.py", "_C.abi3.so", "studies/score_table.py"):
         (folder / name).write_text("x = 2\n")
         keys.append(plan(table(terms=TERMS), {"ball": tmp_path}, ["terms"])[0].key)
     assert keys[0] != keys[1] == keys[2]

@@ -19,7 +19,7 @@ from torch_surfcap.errors import InputError
 from torch_surfcap.studies.score_table import COLUMNS
 
 PACKAGE = Path(__file__).resolve().parents[1]
-STUDIES = Path(__file__).resolve().parent  # no part of a fit
+STUDIES = Path(__file__).resolve().parent.name  # no part of a fit
 
 
 @dataclass
@@ -133,7 +133,7 @@ def _chosen(table: Table, scene: str, names: Sequence[str]) -> Iterator[tuple[st
 def program_digest() -> str:
     """Stands for the program that fits: the package's Python and its compiled library."""
     files = sorted([*PACKAGE.rglob("*.py"), *PACKAGE.glob("_C*.so")])
-    parts = [file for file in files if not file.is_relative_to(STUDIES)]
+    parts = [file for file in files if STUDIES not in file.relative_to(PACKAGE).parts]
     return _digest([[file.name, hashlib.sha256(file.read_bytes()).hexdigest()] for file in parts])
 
 
