@@ -104,6 +104,9 @@ class CamerasConfig:
     skip: list[str] = field(default_factory=list)  # names or numbers of cameras to leave out
     take: int = _within(0, 0)  # so many training cameras, evenly spread; 0: all
     reject: str = _one_of("auto", *CHOICES["reject"])  # auto: leave out those that contradict the others
+    refine: str = _one_of(
+        "auto", *CHOICES["refine"]
+    )  # auto: correct a calibration that the photographs contradict
 
 
 @dataclass
@@ -206,6 +209,7 @@ def fit_arguments(config: Config) -> dict[str, Any]:
         "gains": config.gains,
         "gain_per": config.gain_per,
         "reject": config.cameras.reject,
+        "refine": config.cameras.refine,
         "floor": config.floor,
         "start": config.start,
         "upscale": config.upscale,
@@ -370,5 +374,5 @@ def _check(config: Any, source: str, prefix: str = "") -> None:
 
 
 # Fields in which "auto" is a word like any other.
-_SAYS_ON = {"gains", "floor"}  # and on and off, which YAML takes for true and false
-_SAYS_AUTO = {"cameras.reject", "data.format", "device", "images", "gains", "floor"}
+_SAYS_ON = {"cameras.refine", "gains", "floor"}  # and on and off, which YAML takes for true and false
+_SAYS_AUTO = {"cameras.refine", "cameras.reject", "data.format", "device", "images", "gains", "floor"}

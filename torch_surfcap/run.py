@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import trimesh
 
@@ -36,6 +37,18 @@ def read_run(run: Path, device: str = "cpu") -> tuple[settings.Config, SurfaceFi
 
 def gains_fitted(run: Path) -> bool:
     """Whether a finished run brought its cameras to a common exposure, by its metrics.json; False without one."""
+    return _chosen(run, "gains").get("value") == "on"
+
+
+def motions(run: Path) -> dict[str, list[float]]:
+    """How the cameras of a finished run were refined, see ``FitResult.motion``."""
+    found = _chosen(run, "cameras").get("motion", {})
+    return found if isinstance(found, dict) else {}
+
+
+def _chosen(run: Path, name: str) -> dict[str, Any]:
+    """What a run's metrics.json says of a choice."""
     path = run / "metrics.json"
     chosen = read_json(path).get("chosen", {}) if path.is_file() else {}
-    return isinstance(chosen, dict) and chosen.get("gains", {}).get("value") == "on"
+    found = chosen.get(name, {}) if isinstance(chosen, dict) else {}
+    return found if isinstance(found, dict) else {}

@@ -34,9 +34,10 @@ from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.data.geometry import Points, read_mesh, read_points
 from torch_surfcap.data.parse import read_json
 from torch_surfcap.errors import InputError
+from torch_surfcap.fitting.alignment import aligned
 from torch_surfcap.metrics import surface_scores
 from torch_surfcap.protocols import dtu, table
-from torch_surfcap.run import check_run, gains_fitted, read_run
+from torch_surfcap.run import check_run, gains_fitted, motions, read_run
 
 ERROR_VIEWS = 4
 
@@ -102,6 +103,7 @@ def _score(run: Path, scan: dtu.Scan | None, options: argparse.Namespace) -> dic
     elif truth is not None or points is not None or concave is not None:
         results["surface"] = surface_scores(mesh, truth, points, concave, options.cut, options.cut / 5)
     gains = gains_fitted(run)
+    capture = aligned(capture, motions(run))
     splits = {"test": capture.test, "train": capture if options.train or scan is not None else None}
     for name, views in splits.items():
         if views is not None:

@@ -36,6 +36,7 @@ from torch_surfcap import devices, report
 from torch_surfcap.config import Config
 from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.errors import InputError
+from torch_surfcap.fitting.alignment import aligned
 from torch_surfcap.fitting.checkpoint import FREE, Checkpoints
 from torch_surfcap.fitting.fit import FitResult, Progress, fit
 
@@ -91,11 +92,12 @@ def run(config: Config, started: float = 0.0, method: Callable[..., FitResult] =
         label = settings.to_yaml(config)
         checkpoints = Checkpoints(out / CHECKPOINT, config.checkpoint, config.resume, label)
         result = method(capture, bars, checkpoints, device=str(device), **settings.fit_arguments(config))
+    seen = aligned(capture, result.motion)
     for warning in result.warnings[len(capture.warnings) :]:
         print(f"warning: {warning}")
     seconds |= result.seconds
-    metrics = _metrics(result, capture, seconds, device)
-    _write(out, config, result, capture, metrics, start - started)
+    metrics = _metrics(result, seen, seconds, device)
+    _write(out, config, result, seen, metrics, start - started)
     _summary(metrics, out)
 
 

@@ -43,7 +43,8 @@ VIEW = "view_"  # begins the names of what is the view-dependent colour's own
 class Record:
     """What a fit has to tell so far. warnings; history: a row per iteration; seconds: of the levels that are done;
     level_bytes: what each level was estimated to need; left_out: cameras, by name, and why; difference: of each camera's
-    photograph from what the field shows."""
+    photograph from what the field shows; shift: by how many pixels each photograph lay beside it when that was judged;
+    abandoned: seconds of levels that were begun again."""
 
     warnings: list[str] = field(default_factory=list)
     history: list[dict[str, float]] = field(default_factory=list)
@@ -51,6 +52,8 @@ class Record:
     level_bytes: list[int] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
     difference: dict[str, float] = field(default_factory=dict)
+    shift: dict[str, float] = field(default_factory=dict)
+    abandoned: float = 0.0
 
 
 @dataclass
@@ -82,6 +85,8 @@ class Saved:
             name: torch.from_numpy(a).to(device) for name, a in self.arrays.items() if name != "generator"
         }
         studio.exposure = Exposure(arrays["gain"], arrays["bias"])
+        studio.motion, studio.refines = arrays["motion"], plain["refines"]
+        studio.look_again()
         if torch.device(plain["settings"]["device"]).type == device.type:
             studio.generator.set_state(torch.from_numpy(self.arrays["generator"]))
         else:
@@ -97,6 +102,7 @@ class Saved:
         ranges = (offsets, arrays["ranges"]) if settings.descent.visit == "ranges" else None
         rays = rays_of(capture, grid, list(pixels), ranges, settings.descent.bundle)
         rays.expose(capture, studio.backdrop, studio.exposure)
+        studio.aim(rays, level)
         adam = self._continued(begin_adam(store, settings), arrays)
         march = march_of(settings, level)
         rule = Plateau(**plain["rule"])
@@ -170,6 +176,7 @@ class Checkpoints:
             "cameras": capture.names,
             "number": stage.number,
             "rule": asdict(stage.rule),
+            "refines": studio.refines,
             "moved": stage.moved,
             "compared": stage.compared,
             "seconds": stage.seconds,
@@ -186,6 +193,7 @@ class Checkpoints:
             "generator": studio.generator.get_state(),
             "gain": studio.exposure.gain,
             "bias": studio.exposure.bias,
+            "motion": studio.motion,
         }
         fields = [("", stage.grid, stage.adam)]
         if stage.view:

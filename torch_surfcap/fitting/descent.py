@@ -10,6 +10,7 @@ import torch
 
 from torch_surfcap import ops
 from torch_surfcap.field.field import MISSING
+from torch_surfcap.fitting.alignment import Registration
 from torch_surfcap.fitting.budget import partial_gradients
 from torch_surfcap.fitting.gathered import COSINES, GatheredGradient
 from torch_surfcap.fitting.late import Reading, Row, Stopwatch
@@ -24,6 +25,9 @@ VOXEL_LOSSES = ("tv_opacity", "tv_color", "parsimony", "ballooning", "curvature"
 BALLOONING, CURVATURE = (VOXEL_LOSSES.index(name) for name in ("ballooning", "curvature"))
 GAINS_EVERY = 5  # iterations between two fits of the cameras' gains
 FIRST_GAINS = 10  # iterations before the first: until then the field is grey and says nothing
+ALIGN_EVERY = 5  # iterations between two registrations of the photographs
+FIRST_ALIGN = 30  # iterations before the first: until then the field is coarser than the pictures
+LAST_ALIGN = 10  # iterations of the last level after which cameras stay: what is left is too little to see
 
 
 def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dict[str, float]]:
@@ -58,6 +62,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     gathered = GatheredGradient(rays, grid, settings, stage.march) if settings.gradient == "gather" else None
     gradients = None if gathered else partial_gradients(store, settings.accumulator)
     samples = rays.samples(stage.march.step)
+    registration: Registration | None = None
     watch = Stopwatch(stage.seconds, store.device)
     while stage.goes_on:
         iteration = rule.count + len(stage.waiting)
@@ -104,6 +109,11 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
         if studio.gains and (stage.number > 0 or iteration >= FIRST_GAINS) and iteration % GAINS_EVERY == 0:
             studio.fit_exposure(stage, color, transmittance)
             watch.lap("gains")
+        if studio.refines and iteration % ALIGN_EVERY == 0 and _may_align(stage, iteration):
+            registration = registration or Registration.of(rays, studio.given[stage.level.halvings], grid)
+            studio.align(stage, registration, color, transmittance)
+            stage.moved = REFRESH  # the ranges are those of rays that looked elsewhere
+            watch.lap("align")
         known = {
             "samples": samples,
             "iteration": float(iteration),
@@ -118,3 +128,10 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     while stage.waiting:
         yield stage.told()
     watch.stop()
+
+
+def _may_align(stage: Stage, iteration: int) -> bool:
+    """Whether cameras are refined at this time of a level."""
+    if stage.level.last:
+        return iteration <= LAST_ALIGN
+    return stage.number > 0 or iteration >= FIRST_ALIGN

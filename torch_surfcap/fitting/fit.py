@@ -15,7 +15,7 @@ from torch_surfcap.data.checks import leave_out, prepare
 from torch_surfcap.data.floor import find_floor
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
-from torch_surfcap.fitting import outliers
+from torch_surfcap.fitting import alignment, outliers
 from torch_surfcap.fitting.budget import Budget, estimate, lack, shortage
 from torch_surfcap.fitting.checkpoint import Checkpoints, Record, Saved
 from torch_surfcap.fitting.descent import descend
@@ -53,6 +53,11 @@ class FitResult:
     def gains(self) -> bool:
         """Whether the cameras were brought to a common exposure."""
         return bool(self.chosen["gains"]["value"] == "on")
+
+    @property
+    def motion(self) -> dict[str, list[float]]:
+        """By the names of the cameras whose calibration was refined: shift (2), zoom and roll of the picture plane."""
+        return self.chosen.get("cameras", {}).get("motion", {})
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,8 @@ def _fit(
     if len(mesh.faces) == 0:
         raise InputError("surface: the fit ended without any, expected a subject inside the silhouettes")
     seconds["levels"] = so_far.seconds
+    if so_far.abandoned:
+        seconds["abandoned"] = so_far.abandoned
     exposure = studio.exposure = studio.exposure.cpu()
     return FitResult(
         surface,
@@ -168,6 +175,7 @@ class _Run:
     saved: Saved | None
     checkpoints: Checkpoints | None
     report: Callable[[Progress], None]
+    begin_again: bool = False
 
     def outcome(self, watch: Stopwatch) -> Outcome:
         """Of the last level, or of the one before that for which there is no memory.
@@ -183,6 +191,9 @@ class _Run:
         except torch.OutOfMemoryError as error:
             raise InputError(f"memory: {self._short_of(number, ran_out=True)}") from error
         while number < len(self.plan) - 1:
+            if self.begin_again:
+                number, before, stage = 0, None, self._again()
+                continue
             number += 1
             missing = self._short_of(number)
             if missing is None:
@@ -218,6 +229,25 @@ class _Run:
         studio.keep_pictures(s.images, so_far.level_bytes)
         return begin_stage(s, plan, 0, grid, store, studio)
 
+    def _again(self) -> Stage:
+        """The first level anew, done, without the cameras that were left out after one: what they carved off the hull, no
+        level would give back."""
+        self.begin_again = False
+        so_far, s = self.so_far, self.settings
+        so_far.abandoned += sum(sum(level.values()) for level in so_far.seconds)
+        so_far.seconds.clear()
+        self.studio.motion = torch.zeros_like(self.studio.motion)
+        self.studio.refines = s.refine != "off"
+        self.studio.look_again()
+        coarsest, names = self.plan[0], self.capture.names
+        left = [i for i, name in enumerate(names) if name not in so_far.left_out]
+        pictures = self.studio.pictures[coarsest.halvings].subset(left)
+        grid, store = first_field(pictures, self.box, coarsest.voxel_size, s, self.studio.floor)
+        stage = begin_stage(s, self.plan, 0, grid, store, self.studio)
+        self._save(stage)
+        self._descend(stage)
+        return stage
+
     def _descend(self, stage: Stage) -> None:
         """All that is left of a level."""
         for row in descend(stage, self.studio, self.settings):
@@ -235,14 +265,34 @@ class _Run:
         difference = outliers.differences(stage.rays, rendered(stage, self.settings)).cpu()
         so_far.difference = {n: float(x) for n, x in zip(names, difference, strict=True) if x.isfinite()}
         if self.settings.reject == "auto" and stage.number < len(self.plan) - 1:
-            for i, why in outliers.by_photographs(difference).items():
+            found = outliers.by_photographs(difference, len(so_far.left_out))
+            self.begin_again = bool(found)
+            for i, why in found.items():
                 so_far.left_out[names[i]] = why
-                so_far.warnings.append(
-                    f"camera {names[i]} is left out from level {stage.number + 2} on: {why}"
-                )
+                so_far.warnings.append(f"camera {names[i]} is left out: {why}")
             self._leave_out()
+        self._judge_calibration(stage)
         watch.lap("judge")
         watch.stop()
+
+    def _judge_calibration(self, stage: Stage) -> None:
+        """After the second level of three or more, else the first: whether the cameras go on to be refined, or are what
+        they were."""
+        studio, so_far = self.studio, self.so_far
+        if stage.number == min(1, len(self.plan) - 2) and studio.refines:
+            shift = alignment.shifts(studio.given[0], studio.motion)
+            known = [i for i, name in enumerate(self.capture.names) if name not in so_far.left_out]
+            usual = float(shift[known].median())
+            so_far.shift = {self.capture.names[i]: float(shift[i]) for i in known}
+            off = usual > alignment.OFF * 2**stage.level.halvings
+            if off:
+                so_far.warnings.append(
+                    f"cameras: the photographs lie {usual:.2f} pixels beside what the others show (the median camera), "
+                    "the calibration is refined"
+                )
+            elif self.settings.refine == "auto":
+                studio.refines, studio.motion = False, torch.zeros_like(studio.motion)
+        studio.look_again()
 
     def _leave_out(self) -> None:
         """Takes the rays of the cameras that are left out after a level from the levels to come."""
@@ -296,6 +346,8 @@ def _chosen(
             "value": len(so_far.difference),
             "left_out": so_far.left_out,
             "difference": so_far.difference,
+            "shift": so_far.shift,
+            "motion": studio.motions(),
             "reason": "all that agree" if s.reject == "auto" else "all, as given",
         },
         "floor": {

@@ -14,7 +14,7 @@ from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.hull import Silhouettes, first_guess
 from torch_surfcap.fitting.rays import RayBatch
 
-FEWEST = 5  # cameras: among fewer, nobody can say who is wrong
+FEWEST = 8  # cameras: among fewer, each rightly excludes much that the others leave, and nobody can say who is wrong
 MOST = 0.15  # share of the cameras that may be wrong
 CELLS = 40  # points along the side of the cube that silhouettes are compared in
 CARVED = 0.15  # share of what the others leave that a wrong silhouette takes away ...
@@ -63,8 +63,8 @@ def differences(rays: RayBatch, color: Tensor) -> Tensor:
     return torch.stack([total / count for total, count in sums])
 
 
-def by_photographs(difference: Tensor) -> dict[int, str]:
-    """Number -> why, of the cameras whose ``differences`` [N] are far above the others'."""
+def by_photographs(difference: Tensor, gone: int = 0) -> dict[int, str]:
+    """Number -> why, of the cameras whose ``differences`` [N] are far above the others'. gone: cameras left out before."""
     known = difference[difference.isfinite()]
     if len(known) < FEWEST:
         return {}
@@ -72,7 +72,7 @@ def by_photographs(difference: Tensor) -> dict[int, str]:
     far = [
         i for i, value in enumerate(difference.tolist()) if value > max(FAR * usual, DIFFERENCE)
     ]  # (NaN is not)
-    if len(far) > max(1, int(MOST * len(known))):
+    if gone + len(far) > max(1, int(MOST * (gone + len(known)))):
         return {}  # so many cannot all be wrong: the scene is hard for some
     return {
         i: f"its photograph differs by {float(difference[i]):.3f} from what the others show, them by {usual:.3f} (wrong "

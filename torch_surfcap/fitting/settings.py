@@ -81,6 +81,7 @@ CHOICES = {
     "gains": ("auto", "on", "off"),
     "gain_per": ("channel", "camera"),
     "reject": ("auto", "off"),
+    "refine": ("auto", "on", "off"),
     "floor": ("auto", "off"),
     "start": ("hull", "constant"),
     "upscale": ("plain", "sqrt"),
@@ -106,6 +107,8 @@ class FitSettings:
                their values are then less true, the pictures are not
     gain_per:  "channel" or "camera", what has a gain and bias of its own
     reject:    "auto": cameras that contradict the others are left out (see ``torch_surfcap.fitting.outliers``); "off"
+    refine:    "auto": where photographs lie beside what the field shows of them, the cameras are turned towards it (see
+               ``torch_surfcap.fitting.alignment``); "on": however little it is; "off"
     floor:     "auto": nothing lies below the floor that the plates show, where they show one; "off"
     start:     "hull": the first field falls off at the hull's surface; "constant": a transparency is the same fog inside
     upscale:   "plain" or "sqrt": a transparency at a change of level stays, or becomes its root, so that two fine voxels
@@ -135,6 +138,7 @@ class FitSettings:
     gains: str = "auto"
     gain_per: str = "channel"
     reject: str = "auto"
+    refine: str = "auto"
     floor: str = "auto"
     start: str = "constant"
     upscale: str = "plain"

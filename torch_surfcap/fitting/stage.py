@@ -9,11 +9,13 @@ from torch import Tensor
 
 from torch_surfcap import codes, devices, ops
 from torch_surfcap.autograd import March
+from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.floor import Floor
 from torch_surfcap.field.field import MISSING, SLOPE, SurfaceField
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
+from torch_surfcap.fitting.alignment import Registration, aim, moved
 from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.late import Row, Stopwatch
 from torch_surfcap.fitting.levels import Level, cut_at_floor, next_level
@@ -31,7 +33,8 @@ class Studio:
 
     pictures: the capture, halved 0, 1, ... times. backdrop: see ``RayBatch.expose``. generator: of the lattices' shifts.
     gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera. floor: below
-    which nothing is, where one was found.
+    which nothing is, where one was found. given: the cameras of the pictures, as calibrated. motion: [N, 4] by which their
+    pictures have moved since (see ``torch_surfcap.fitting.alignment``); refines: whether they go on to.
     """
 
     pictures: list[Capture]
@@ -40,7 +43,10 @@ class Studio:
     gains: bool
     per_channel: bool
     generator: torch.Generator
-    floor: Floor | None = None
+    floor: Floor | None
+    given: list[Cameras]
+    motion: Tensor
+    refines: bool
 
     def keep_pictures(self, images: str, level_bytes: list[int]) -> None:
         """Takes the pictures to the device where ``images`` says so; "auto": if they fit beside the largest level."""
@@ -60,6 +66,26 @@ class Studio:
             without.prepared = capture.prepared
             without.masks = [torch.zeros_like(m) if i in cameras else m for i, m in enumerate(capture.masks)]
             self.pictures[n] = without
+
+    def align(self, stage: Stage, registration: Registration, color: Tensor, transmittance: Tensor) -> None:
+        """Registers the photographs to renderings of a stage's rays, [R, 3] and [R], and aims the rays anew."""
+        self.motion = registration.refined(self.motion, stage.rays, color, transmittance)
+        self.aim(stage.rays, stage.level)
+
+    def aim(self, rays: RayBatch, level: Level) -> None:
+        """The rays of a level as the cameras now look."""
+        if self.refines:
+            aim(rays, self.given[level.halvings], self.motion)
+
+    def motions(self) -> dict[str, list[float]]:
+        """The same by the cameras' names; none where the calibration stands."""
+        named = zip(self.pictures[0].names, self.motion.tolist(), strict=True)
+        return {name: motion for name, motion in named if any(motion)}
+
+    def look_again(self) -> None:
+        """Rays of the levels to come are those of the cameras as they now look."""
+        for capture, given in zip(self.pictures, self.given, strict=True):
+            capture.cameras = moved(given, self.motion)
 
     def fit_exposure(self, stage: Stage, color: Tensor, transmittance: Tensor) -> None:
         """Takes the cameras' gains out of renderings of a stage's rays, [R, 3] and [R], and exposes the rays anew."""
@@ -182,6 +208,7 @@ def begin_stage(
     capture = studio.pictures[level.halvings]
     rays = gather_rays(capture, store, grid, settings.opacity, march, descent.bundle, descent.visit)
     rays.expose(capture, studio.backdrop, studio.exposure)
+    studio.aim(rays, level)
     adam = begin_adam(store, settings)
     rule = Plateau.of(3 * level.iterations, descent)
     view = begin_view_color(settings, grid, floats, rays, march, view)
@@ -199,7 +226,10 @@ def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: F
     backdrop = None if backdrop is None else backdrop.to(settings.device)
     per_channel = settings.gain_per == "channel"
     gains = settings.gains != "off"
-    return Studio(pictures, backdrop, equal, gains, per_channel, generator, floor)
+    given = [picture.cameras for picture in pictures]
+    motion = torch.zeros(len(capture), 4, dtype=torch.float64, device=settings.device)
+    refines = settings.refine != "off"
+    return Studio(pictures, backdrop, equal, gains, per_channel, generator, floor, given, motion, refines)
 
 
 def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:

@@ -1,0 +1,190 @@
+"""Cameras whose calibration is off: each photograph is registered to what the field shows of it.
+
+What all cameras together made of the field is truer than the calibration of any one. With F + T B a rendering (F the
+field's own part of a ray, T its transmittance, B what is behind it), camera i's photograph P is, to first order in a motion
+d of its picture plane,
+
+    P(x) = F + T B + (grad F + B grad T) d(x),   d(x) = t + s x + r (-x_2, x_1):
+
+the background does not move with the field. x are pixels through K^-1, so that shift t, zoom s and roll r mean the same on
+every level; they are found as by Lucas and Kanade (1981). Near the subject a small rotation or translation of a camera is
+such a motion. What a similarity of the whole scene explains is not the cameras' to have: else scene and cameras could
+wander off together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torch_surfcap.data.cameras import Cameras
+from torch_surfcap.data.capture import Capture
+from torch_surfcap.field.tiles import TileGrid
+from torch_surfcap.fitting.rays import RayBatch
+
+RAYS = 8192  # of a camera that are compared, at most
+ROBUST = 0.1  # difference of colours above which it counts linearly
+# What is known beforehand: shift (pixels of the level), zoom and roll are 0 to within these, a colour to within NOISE.
+DEVIATION, NOISE = (1.0, 1.0, 0.01, 0.01), 0.05
+FARTHEST = 0.05  # of a picture's size: a camera that seems shifted further is wrong altogether, and stays where it is
+OFF = 0.1  # median shift, pixels of the level, above which a calibration is off: below, the registration itself errs
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How the rays of a level register with N cameras' photographs; on the rays' device.
+
+    chosen: [M] rays of which all four neighbours are rays too, a part of each camera's; starts: [N + 1] where each camera's
+    begin; beside: [4, M] their neighbours left, right, above, below. camera: [M]. at: [M, 2] pixels through K^-1. given: the
+    calibration as it was given, pictures of the level's size. focal: [N, 2]. common [4 N, 7], inverse [7, 4 N]: motions that
+    a similarity of the scene causes, and the similarity nearest to motions.
+    """
+
+    chosen: Tensor
+    starts: list[int]
+    beside: Tensor
+    camera: Tensor
+    at: Tensor
+    given: Cameras
+    focal: Tensor
+    common: Tensor
+    inverse: Tensor
+
+    @staticmethod
+    def of(rays: RayBatch, given: Cameras, grid: TileGrid) -> Registration:
+        """grid: whose box holds the scene."""
+        device = rays.pixels.device
+        chosen, beside, at, starts = [], [], [], [0]
+        for i in range(len(given)):
+            inner, neighbours = _inner(rays, given, i)
+            chosen.append(inner)
+            beside.append(neighbours)
+            at.append(_through_inverse(given, i, rays.pixels[inner])[:, :2].float())
+            starts.append(starts[-1] + len(inner))
+        counts = torch.tensor(starts, device=device).diff()
+        focal = given.K[:, [0, 1], [0, 1]]
+        common, inverse = _similarities(given, grid)
+        return Registration(
+            torch.cat(chosen),
+            starts,
+            torch.cat(beside, 1),
+            torch.arange(len(given), device=device).repeat_interleave(counts, output_size=starts[-1]),
+            torch.cat(at),
+            given,
+            focal.to(device),
+            common.to(device),
+            inverse.to(device),
+        )
+
+    def refined(self, motion: Tensor, rays: RayBatch, color: Tensor, transmittance: Tensor) -> Tensor:
+        """The motions [N, 4] (t, s, r; float64) that the rays are aimed by, after what renderings [R, 3], [R] say of them."""
+        through = transmittance[:, None]
+        field = torch.cat([color - through * rays.background, through], 1)
+        left, right, above, below = (field[index] for index in self.beside)
+        slope = torch.stack([right - left, below - above], 2) / 2 * self.focal[self.camera, None].float()
+        slope = slope[:, :3] + rays.background[self.chosen, :, None] * slope[:, 3:]
+        (u, v), (x, y) = slope.unbind(2), self.at.split(1, 1)
+        residual = (rays.target - color)[self.chosen]
+        weight = (ROBUST / residual.abs().clamp(min=ROBUST)).sqrt()
+        rows = torch.stack([u, v, u * x + v * y, v * x - u * y, residual], 2) * weight[..., None]
+        ends = zip(self.starts, self.starts[1:], strict=False)
+        cameras = (rows[begin:end].flatten(0, 1).double() for begin, end in ends)
+        products = torch.stack([camera.T @ camera for camera in cameras])
+        deviation = motion.new_tensor(DEVIATION).repeat(len(motion), 1)
+        deviation[:, :2] /= self.focal
+        normal = products[:, :4, :4] + torch.diag_embed((NOISE / deviation) ** 2)
+        total = motion + torch.linalg.solve(normal, products[:, :4, 4])
+        size = self.given.size.amax(1).to(motion.device)
+        near = (total[:, :2] * self.focal).norm(dim=1) < FARTHEST * size
+        total = total * near[:, None]
+        return total - (self.common @ (self.inverse @ total.flatten())).view_as(total)
+
+
+def aim(rays: RayBatch, given: Cameras, motion: Tensor) -> None:
+    """Turns the rays, in place, to where cameras look once their pictures have moved. given: as they were calibrated."""
+    for i, (tx, ty, zoom, roll) in enumerate(motion):
+        part = rays.of_camera(i)
+        x, y, z = _through_inverse(given, i, rays.pixels[part]).unbind(1)
+        point = torch.stack([x + tx + zoom * x - roll * y, y + ty + zoom * y + roll * x, z], 1)
+        direction = point @ given.world_to_camera[i, :3, :3].to(point.device)
+        rays.directions[part] = torch.nn.functional.normalize(direction, dim=1).float()
+
+
+def shifts(given: Cameras, motion: Tensor) -> Tensor:
+    """[N] length of the motions' shifts, in pixels of these cameras' pictures."""
+    return (motion[:, :2].cpu() * given.K[:, [0, 1], [0, 1]]).norm(dim=1)
+
+
+def moved(cameras: Cameras, motion: Tensor) -> Cameras:
+    """The cameras whose pictures have moved by [N, 4], of whatever size they are: x + d(x) = k (cos, -sin; sin, cos) x + t
+    is a longer focal length, another principal point and a turn about the line of sight."""
+    motion = motion.cpu().double()
+    shift, along, across = motion[:, :2], 1 + motion[:, 2], motion[:, 3]
+    k = torch.hypot(along, across)
+    turn = torch.eye(4, dtype=torch.float64).repeat(len(k), 1, 1)
+    turn[:, 0, 0] = turn[:, 1, 1] = along / k
+    turn[:, 1, 0], turn[:, 0, 1] = across / k, -across / k
+    back = turn.transpose(1, 2)
+    narrowed = torch.eye(3, dtype=torch.float64).repeat(len(k), 1, 1)
+    narrowed[:, [0, 1], [0, 1]] = (1 / k)[:, None]
+    narrowed[:, :2, 2] = -(back[:, :2, :2] @ shift[:, :, None])[:, :, 0] / k[:, None]
+    return Cameras(cameras.K @ narrowed, back @ cameras.world_to_camera, cameras.size)
+
+
+def aligned(capture: Capture, motions: Mapping[str, Sequence[float]]) -> Capture:
+    """A capture as its cameras look after motions (t, s, r) by name; the others stay."""
+    motion = torch.tensor([[*motions.get(name, (0.0,) * 4)] for name in capture.names], dtype=torch.float64)
+    found = capture.subset(range(len(capture)))
+    found.cameras = moved(capture.cameras, motion)
+    return found
+
+
+def _inner(rays: RayBatch, cameras: Cameras, i: int) -> tuple[Tensor, Tensor]:
+    """Some rays [M] of camera i, evenly spread, of which all neighbours [4, M] are rays too."""
+    width, height = cameras.size[i].tolist()
+    part = rays.of_camera(i)
+    pixels = rays.pixels[part].long()
+    stride = width + 2  # a border without rays: nothing beyond it is a neighbour
+    place = (pixels // width + 1) * stride + pixels % width + 1
+    number = pixels.new_full(((height + 2) * stride,), -1)
+    number[place] = torch.arange(part.start, part.stop, device=pixels.device)
+    beside = torch.stack([number[place + step] for step in (-1, 1, -stride, stride)])
+    inner = (beside >= 0).all(0).nonzero()[:, 0]
+    inner = inner[:: max(1, -(-len(inner) // RAYS))]
+    return inner + part.start, beside[:, inner]
+
+
+def _through_inverse(cameras: Cameras, i: int, pixels: Tensor) -> Tensor:
+    """[M, 3] float64: K^-1 times the centres of pixels, given by their row-major numbers [M]."""
+    width = int(cameras.size[i, 0])
+    number = pixels.double()
+    row = (number / width).floor()
+    centers = torch.stack([number - width * row + 0.5, row + 0.5, torch.ones_like(row)], 1)
+    return centers @ torch.linalg.inv(cameras.K[i]).T.to(pixels.device)
+
+
+def _similarities(cameras: Cameras, grid: TileGrid) -> tuple[Tensor, Tensor]:
+    """Motions [4 N, 7] by which pictures follow a shift, turn and growth of the scene about its middle, and the operator
+    [7, 4 N] that finds those nearest to given motions, as lengths at the middle of the scene."""
+    R = cameras.world_to_camera[:, :3, :3]
+    half = torch.tensor(grid.size, dtype=torch.float64) * (4 * grid.voxel_size / 2)
+    middle = torch.tensor(grid.origin, dtype=torch.float64) + half
+    radius = float(half.max()) / 2  # where, on average, there is something to turn and to grow
+    seen = R @ middle + cameras.world_to_camera[:, :3, 3]
+    depth = seen[:, 2].clamp(min=1e-6)
+    x, y = (seen[:, :2] / depth[:, None]).unbind(1)
+    effect = torch.zeros(len(R), 4, 7, dtype=torch.float64)  # lengths
+    effect[:, :2, :3], effect[:, 2, :3] = R[:, :2], -R[:, 2] * (radius / depth)[:, None]
+    effect[:, 3, 3:6], effect[:, 2, 6] = R[:, 2] * radius, radius
+    # From a motion to lengths: how far it moves what is seen of the middle, and what is `radius` beside it.
+    lengths = torch.zeros(len(R), 4, 4, dtype=torch.float64)
+    lengths[:, 0, 0] = lengths[:, 1, 1] = depth
+    lengths[:, 0, 2], lengths[:, 1, 2] = depth * x, depth * y
+    lengths[:, 0, 3], lengths[:, 1, 3] = -depth * y, depth * x
+    lengths[:, 2, 2] = lengths[:, 3, 3] = radius
+    common = torch.linalg.solve(lengths, effect).flatten(0, 1)
+    nearest = torch.linalg.pinv(effect.flatten(0, 1)).view(7, len(R), 4)
+    return common, torch.einsum("knj,nji->kni", nearest, lengths).flatten(1)
