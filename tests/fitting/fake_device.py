@@ -12,6 +12,7 @@ import copy
 import itertools
 import sys
 from dataclasses import fields, is_dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -28,6 +29,7 @@ from tests.fitting.stages import begun
 from torch_surfcap import Cameras, Capture
 from torch_surfcap.fitting import descent, late
 from torch_surfcap.fitting.adam import TileAdam
+from torch_surfcap.fitting.alignment import Registration
 from torch_surfcap.fitting.gathered import GatheredGradient
 from torch_surfcap.fitting.rays import RayBatch
 
@@ -76,6 +78,8 @@ def iterate(plates: bool = False, **given: Any) -> int:
     real = None
     if settings.gradient == "gather":
         real = GatheredGradient(stage.rays, stage.grid, settings, stage.march)
+    registration = Registration.of(stage.rays, studio.given[0], stage.grid)
+    studio.refines = True
     count = stage.rays.samples(stage.march.step)
 
     def told(row: late.Row) -> dict[str, float]:
@@ -93,6 +97,8 @@ def iterate(plates: bool = False, **given: Any) -> int:
             there = moved(real)
             there.rays = stage.rays
             patched.GatheredGradient = lambda *_: there
+        known = moved(registration)
+        patched.Registration = SimpleNamespace(of=lambda *_: known)
         return len(list(itertools.islice(descent.descend(stage, studio, settings), ROWS)))
 
 

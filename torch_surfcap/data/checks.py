@@ -8,7 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_surfcap.data.borders import border_offset
+from torch_surfcap.data.images import Picture
 from torch_surfcap.data.load import in_threads
+from torch_surfcap.data.morphology import widened
 from torch_surfcap.data.plates import separate
 from torch_surfcap.data.silhouettes import black_silhouette, fit_to_background
 from torch_surfcap.errors import InputError
@@ -57,21 +60,18 @@ def leave_out(capture: Capture, faults: dict[int, str]) -> Capture:
 
 
 def _find_masks(capture: Capture, shadows: bool = True) -> Capture:
-    """A copy with masks: found by plates, or by a black background, where the capture has none; given ones are
-    corrected where a background of one colour shows that they are too wide or too narrow.
+    """A copy with masks: found by plates, or by a black background, where the capture has none; given ones that are too
+    wide or too narrow are found anew by the plates, or corrected where there are none.
 
     With `shadows` plates that were needed for it become the room in the subject's shadow.
     """
     found = capture.subset(range(len(capture)))
     photographs = [image.numpy() for image in capture.images]
     if capture.masks is not None:
-        if capture.plates is None:  # else these show where the subject is
-            fitted, pixels = fit_to_background(photographs, [mask.numpy() for mask in capture.masks])
-            if pixels:
-                what = "cut a part of the subject off" if pixels > 0 else "include the background"
-                found.masks = [torch.from_numpy(mask) for mask in fitted]
-                found.warnings.append(f"masks: {what}, corrected by up to {abs(pixels)} pixels")
-        return found
+        pixels = _correct_masks(found, photographs)
+        if capture.plates is None or not pixels:
+            return found
+        found.warnings.append(f"{_wrong_by(pixels)}, silhouettes are found by the plates instead")
     if capture.plates is not None:
         plates = [plate.numpy() for plate in capture.plates]
         separated = in_threads(lambda pair: separate(*pair), zip(photographs, plates, strict=True))
@@ -92,6 +92,31 @@ def _find_masks(capture: Capture, shadows: bool = True) -> Capture:
         none if mask is None else torch.from_numpy(mask) for mask, none in zip(masks, blank, strict=True)
     ]
     return found
+
+
+def _correct_masks(capture: Capture, photographs: list[Picture]) -> int:
+    """By how many pixels the masks end within the subject (beyond it where negative); those before a background of one
+    colour or, without plates, any other are corrected."""
+    assert capture.masks is not None
+    masks = [mask.numpy() for mask in capture.masks]
+    if capture.plates is None:
+        fitted, pixels = fit_to_background(photographs, masks)
+        if pixels:
+            capture.masks = [torch.from_numpy(mask) for mask in fitted]
+            capture.warnings.append(f"{_wrong_by(pixels)}, corrected")
+            return pixels
+    if capture.mask_source != "file":  # alpha goes with its colours, which end nowhere
+        return 0
+    pixels = border_offset(photographs, masks)
+    if pixels and capture.plates is None:
+        capture.masks = [torch.from_numpy(widened(mask, pixels)) for mask in masks]
+        capture.warnings.append(f"{_wrong_by(pixels)}, corrected")
+    return pixels
+
+
+def _wrong_by(pixels: int) -> str:
+    what = "cut a part of the subject off" if pixels > 0 else "include the background"
+    return f"masks: {what}, by up to {abs(pixels)} pixels"
 
 
 def _faults(capture: Capture, subject: Tensor | None = None) -> dict[int, str]:

@@ -66,7 +66,7 @@ def without(views: list[View], skip: Sequence[str | int]) -> list[View]:
     return [view for i, view in enumerate(views) if i not in left_out]
 
 
-def evenly(views: list[View], take: int) -> list[View]:
+def evenly(views: list[In], take: int) -> list[In]:
     """`take` of the views, as far apart in their order as can be; all for 0. Raises InputError where there are fewer."""
     if not take:
         return views

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_surfcap.data.images import Plane
+
 Binary = NDArray[np.uint8]
 
 CLOSING = 0.005  # radius of the gaps that are closed, relative to the picture's longer side
@@ -14,6 +16,12 @@ CLOSING = 0.005  # radius of the gaps that are closed, relative to the picture's
 def square(reach: int) -> Binary:
     """The structuring element that reaches so many pixels to all sides."""
     return np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+
+
+def widened(mask: Plane, pixels: int) -> Plane:
+    """The mask grown by so many pixels to all sides, shrunk where negative; edges stay as soft as they are."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(pixels) + 1,) * 2)
+    return np.asarray((cv2.dilate if pixels > 0 else cv2.erode)(mask, disc))
 
 
 def closed(binary: Binary) -> Binary:

@@ -14,6 +14,7 @@ wander off together.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -34,57 +35,102 @@ OFF = 0.1  # median shift, pixels of the level, above which a calibration is off
 
 
 @dataclass(frozen=True)
+class Pinholes:
+    """Cameras as they were calibrated, on the rays' device. K, its inverse, rotation (world to camera): [N, 3, 3]
+    float64; widths: of the pictures."""
+
+    K: Tensor
+    inverse: Tensor
+    rotation: Tensor
+    widths: list[int]
+
+    @staticmethod
+    def of(cameras: Cameras, device: torch.device) -> Pinholes:
+        rotation = cameras.world_to_camera[:, :3, :3]
+        K, inverse, turn = (part.to(device) for part in (cameras.K, torch.linalg.inv(cameras.K), rotation))
+        return Pinholes(K, inverse, turn, cameras.size[:, 0].tolist())
+
+    def through(self, i: int, pixels: Tensor) -> Tensor:
+        """[M, 3] float64: K^-1 times the centres of camera i's pixels, given by their row-major numbers [M]."""
+        number = pixels.double()
+        row = (number / self.widths[i]).floor()
+        centers = torch.stack([number - self.widths[i] * row + 0.5, row + 0.5, torch.ones_like(row)], 1)
+        return centers @ self.inverse[i].T
+
+    def aim(self, rays: RayBatch, motion: Tensor) -> None:
+        """Turns the rays, in place, to where the cameras look once their pictures have moved by [N, 4]."""
+        for i, (tx, ty, zoom, roll) in enumerate(motion):
+            part = rays.of_camera(i)
+            x, y, z = self.through(i, rays.pixels[part]).unbind(1)
+            point = torch.stack([x + tx + zoom * x - roll * y, y + ty + zoom * y + roll * x, z], 1)
+            rays.directions[part] = torch.nn.functional.normalize(point @ self.rotation[i], dim=1).float()
+
+    def projections(self, motion: Tensor) -> Tensor:
+        """[N, 3, 3] what takes directions in the world to pixels once the pictures have moved by [N, 4]."""
+        (tx, ty, zoom, roll), zero = motion.unbind(1), torch.zeros_like(motion[:, 0])
+        a, b = 1 + zoom, roll
+        square = a * a + b * b
+        rows = (
+            (a / square, b / square, -(a * tx + b * ty) / square),
+            (-b / square, a / square, (b * tx - a * ty) / square),
+            (zero, zero, zero + 1),
+        )
+        back = torch.stack([torch.stack(row, 1) for row in rows], 1)
+        return self.K @ back @ self.rotation
+
+
+@dataclass(frozen=True)
 class Registration:
     """How the rays of a level register with N cameras' photographs; on the rays' device.
 
     chosen: [M] rays of which all four neighbours are rays too, a part of each camera's; starts: [N + 1] where each camera's
-    begin; beside: [4, M] their neighbours left, right, above, below. camera: [M]. at: [M, 2] pixels through K^-1. given: the
-    calibration as it was given, pictures of the level's size. focal: [N, 2]. common [4 N, 7], inverse [7, 4 N]: motions that
-    a similarity of the scene causes, and the similarity nearest to motions.
+    begin; beside: [4, M] their neighbours left, right, above, below. at: [M, 2] pixels through K^-1. focal: [M, 2]. prior:
+    [N, 4, 4], what is known of the motions beforehand. farthest: [N], length of a shift. common [4 N, 7], inverse [7, 4 N]:
+    the motions that a similarity of the scene causes, and the similarity nearest to motions.
     """
 
     chosen: Tensor
     starts: list[int]
     beside: Tensor
-    camera: Tensor
     at: Tensor
-    given: Cameras
     focal: Tensor
+    prior: Tensor
+    farthest: Tensor
     common: Tensor
     inverse: Tensor
+    pinholes: Pinholes
 
     @staticmethod
     def of(rays: RayBatch, given: Cameras, grid: TileGrid) -> Registration:
-        """grid: whose box holds the scene."""
+        """given: the cameras as they were calibrated, of the level's pictures; grid: whose box holds the scene."""
         device = rays.pixels.device
-        chosen, beside, at, starts = [], [], [], [0]
-        for i in range(len(given)):
-            inner, neighbours = _inner(rays, given, i)
-            chosen.append(inner)
-            beside.append(neighbours)
-            at.append(_through_inverse(given, i, rays.pixels[inner])[:, :2].float())
-            starts.append(starts[-1] + len(inner))
-        counts = torch.tensor(starts, device=device).diff()
+        pinholes = Pinholes.of(given, device)
+        found = [_inner(rays, given, i) for i in range(len(given))]
+        at = [pinholes.through(i, rays.pixels[chosen])[:, :2].float() for i, (chosen, _) in enumerate(found)]
+        counts = [len(chosen) for chosen, _ in found]
         focal = given.K[:, [0, 1], [0, 1]]
+        deviation = torch.tensor(DEVIATION, dtype=torch.float64).repeat(len(given), 1)
+        deviation[:, :2] /= focal
         common, inverse = _similarities(given, grid)
         return Registration(
-            torch.cat(chosen),
-            starts,
-            torch.cat(beside, 1),
-            torch.arange(len(given), device=device).repeat_interleave(counts, output_size=starts[-1]),
+            torch.cat([chosen for chosen, _ in found]),
+            [0, *itertools.accumulate(counts)],
+            torch.cat([beside for _, beside in found], 1),
             torch.cat(at),
-            given,
-            focal.to(device),
+            focal.float().repeat_interleave(torch.tensor(counts), dim=0).to(device),
+            torch.diag_embed((NOISE / deviation) ** 2).to(device),
+            (FARTHEST * given.size.amax(1) / focal.mean(1)).to(device),
             common.to(device),
             inverse.to(device),
+            pinholes,
         )
 
     def refined(self, motion: Tensor, rays: RayBatch, color: Tensor, transmittance: Tensor) -> Tensor:
-        """The motions [N, 4] (t, s, r; float64) that the rays are aimed by, after what renderings [R, 3], [R] say of them."""
+        """The motions [N, 4] (t, s, r; float64) that the rays are aimed by, after what renderings [R, 3], [R] say."""
         through = transmittance[:, None]
         field = torch.cat([color - through * rays.background, through], 1)
         left, right, above, below = (field[index] for index in self.beside)
-        slope = torch.stack([right - left, below - above], 2) / 2 * self.focal[self.camera, None].float()
+        slope = torch.stack([right - left, below - above], 2) / 2 * self.focal[:, None]
         slope = slope[:, :3] + rays.background[self.chosen, :, None] * slope[:, 3:]
         (u, v), (x, y) = slope.unbind(2), self.at.split(1, 1)
         residual = (rays.target - color)[self.chosen]
@@ -93,24 +139,13 @@ class Registration:
         ends = zip(self.starts, self.starts[1:], strict=False)
         cameras = (rows[begin:end].flatten(0, 1).double() for begin, end in ends)
         products = torch.stack([camera.T @ camera for camera in cameras])
-        deviation = motion.new_tensor(DEVIATION).repeat(len(motion), 1)
-        deviation[:, :2] /= self.focal
-        normal = products[:, :4, :4] + torch.diag_embed((NOISE / deviation) ** 2)
-        total = motion + torch.linalg.solve(normal, products[:, :4, 4])
-        size = self.given.size.amax(1).to(motion.device)
-        near = (total[:, :2] * self.focal).norm(dim=1) < FARTHEST * size
-        total = total * near[:, None]
+        normal = products[:, :4, :4] + self.prior
+        step, _ = torch.linalg.solve_ex(
+            normal, products[:, :4, 4]
+        )  # which waits for no verdict, unlike `solve`
+        total = motion + step
+        total = total * (total[:, :2].norm(dim=1) < self.farthest)[:, None]
         return total - (self.common @ (self.inverse @ total.flatten())).view_as(total)
-
-
-def aim(rays: RayBatch, given: Cameras, motion: Tensor) -> None:
-    """Turns the rays, in place, to where cameras look once their pictures have moved. given: as they were calibrated."""
-    for i, (tx, ty, zoom, roll) in enumerate(motion):
-        part = rays.of_camera(i)
-        x, y, z = _through_inverse(given, i, rays.pixels[part]).unbind(1)
-        point = torch.stack([x + tx + zoom * x - roll * y, y + ty + zoom * y + roll * x, z], 1)
-        direction = point @ given.world_to_camera[i, :3, :3].to(point.device)
-        rays.directions[part] = torch.nn.functional.normalize(direction, dim=1).float()
 
 
 def shifts(given: Cameras, motion: Tensor) -> Tensor:
@@ -155,15 +190,6 @@ def _inner(rays: RayBatch, cameras: Cameras, i: int) -> tuple[Tensor, Tensor]:
     inner = (beside >= 0).all(0).nonzero()[:, 0]
     inner = inner[:: max(1, -(-len(inner) // RAYS))]
     return inner + part.start, beside[:, inner]
-
-
-def _through_inverse(cameras: Cameras, i: int, pixels: Tensor) -> Tensor:
-    """[M, 3] float64: K^-1 times the centres of pixels, given by their row-major numbers [M]."""
-    width = int(cameras.size[i, 0])
-    number = pixels.double()
-    row = (number / width).floor()
-    centers = torch.stack([number - width * row + 0.5, row + 0.5, torch.ones_like(row)], 1)
-    return centers @ torch.linalg.inv(cameras.K[i]).T.to(pixels.device)
 
 
 def _similarities(cameras: Cameras, grid: TileGrid) -> tuple[Tensor, Tensor]:

@@ -62,7 +62,10 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
     gathered = GatheredGradient(rays, grid, settings, stage.march) if settings.gradient == "gather" else None
     gradients = None if gathered else partial_gradients(store, settings.accumulator)
     samples = rays.samples(stage.march.step)
-    registration: Registration | None = None
+    given = studio.given[stage.level.halvings]
+    registration = Registration.of(rays, given, grid) if studio.refines else None
+    if gathered and registration:
+        gathered.look(registration.pinholes.projections(studio.motion))
     watch = Stopwatch(stage.seconds, store.device)
     while stage.goes_on:
         iteration = rule.count + len(stage.waiting)
@@ -109,10 +112,10 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
         if studio.gains and (stage.number > 0 or iteration >= FIRST_GAINS) and iteration % GAINS_EVERY == 0:
             studio.fit_exposure(stage, color, transmittance)
             watch.lap("gains")
-        if studio.refines and iteration % ALIGN_EVERY == 0 and _may_align(stage, iteration):
-            registration = registration or Registration.of(rays, studio.given[stage.level.halvings], grid)
+        if registration and iteration % ALIGN_EVERY == 0 and _may_align(stage, iteration):
             studio.align(stage, registration, color, transmittance)
-            stage.moved = REFRESH  # the ranges are those of rays that looked elsewhere
+            if gathered:
+                gathered.look(registration.pinholes.projections(studio.motion))
             watch.lap("align")
         known = {
             "samples": samples,

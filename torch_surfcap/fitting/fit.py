@@ -22,7 +22,16 @@ from torch_surfcap.fitting.descent import descend
 from torch_surfcap.fitting.late import Stopwatch
 from torch_surfcap.fitting.levels import Level, first_field, plan_levels, subject_box
 from torch_surfcap.fitting.settings import FitSettings
-from torch_surfcap.fitting.stage import Outcome, Stage, Studio, begin_stage, next_stage, open_studio, rendered
+from torch_surfcap.fitting.stage import (
+    Outcome,
+    Stage,
+    Studio,
+    begin_stage,
+    may_refine,
+    next_stage,
+    open_studio,
+    rendered,
+)
 
 if TYPE_CHECKING:
     import trimesh
@@ -237,7 +246,7 @@ class _Run:
         so_far.abandoned += sum(sum(level.values()) for level in so_far.seconds)
         so_far.seconds.clear()
         self.studio.motion = torch.zeros_like(self.studio.motion)
-        self.studio.refines = s.refine != "off"
+        self.studio.refines = may_refine(s, self.plan[0].halvings)
         self.studio.look_again()
         coarsest, names = self.plan[0], self.capture.names
         left = [i for i, name in enumerate(names) if name not in so_far.left_out]

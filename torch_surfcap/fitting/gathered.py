@@ -45,12 +45,16 @@ class GatheredGradient:
         self.exponent = math.floor(math.log2(LARGEST / bound)) if self.narrow and bound > 0 else 0
         cameras = rays.cameras
         device = rays.origins.device
-        self.matrices = (cameras.K @ cameras.world_to_camera[:, :3, :3]).float().to(device)
+        self.look((cameras.K @ cameras.world_to_camera[:, :3, :3]).to(device))
         self.centers = cameras.centers.float().to(device)
         self.rays_per_camera = torch.tensor(rays.camera_starts, device=device).diff()
         self.windows, self.window_rays = camera_windows(rays.pixels, rays.camera_starts, cameras.size[:, 0])
         self.gradient = rays.origins.new_empty(0)
         self.lay_out()
+
+    def look(self, matrices: Tensor) -> None:
+        """Takes [N, 3, 3] from directions in the world to pixels for the cameras'."""
+        self.matrices = matrices.float()
 
     def lay_out(self) -> None:
         """Rows of slots for all samples within the ranges, whatever the shift."""

@@ -14,7 +14,8 @@ from torch_surfcap.data.capture import Capture
 from torch_surfcap.field.hull import Silhouettes, first_guess
 from torch_surfcap.fitting.rays import RayBatch
 
-FEWEST = 8  # cameras: among fewer, each rightly excludes much that the others leave, and nobody can say who is wrong
+FEWEST = 5  # cameras: among fewer, nobody can say who is wrong
+FEW = 8  # silhouettes: of fewer, each rightly excludes much that the others leave
 MOST = 0.15  # share of the cameras that may be wrong
 CELLS = 40  # points along the side of the cube that silhouettes are compared in
 CARVED = 0.15  # share of what the others leave that a wrong silhouette takes away ...
@@ -28,7 +29,7 @@ def by_silhouettes(capture: Capture) -> dict[int, str]:
     assert capture.masks is not None
     count = len(capture)
     most = max(1, int(MOST * count))
-    if count < FEWEST:
+    if count < FEW:
         return {}
     center, radius = first_guess(capture)
     steps = (torch.arange(CELLS, dtype=torch.float64) + 0.5) / CELLS * 2 - 1

@@ -15,7 +15,7 @@ from torch_surfcap.data.floor import Floor
 from torch_surfcap.field.field import MISSING, SLOPE, SurfaceField
 from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting.adam import TileAdam
-from torch_surfcap.fitting.alignment import Registration, aim, moved
+from torch_surfcap.fitting.alignment import Pinholes, Registration, moved
 from torch_surfcap.fitting.color_gain import Exposure
 from torch_surfcap.fitting.late import Row, Stopwatch
 from torch_surfcap.fitting.levels import Level, cut_at_floor, next_level
@@ -70,16 +70,16 @@ class Studio:
     def align(self, stage: Stage, registration: Registration, color: Tensor, transmittance: Tensor) -> None:
         """Registers the photographs to renderings of a stage's rays, [R, 3] and [R], and aims the rays anew."""
         self.motion = registration.refined(self.motion, stage.rays, color, transmittance)
-        self.aim(stage.rays, stage.level)
+        registration.pinholes.aim(stage.rays, self.motion)
 
     def aim(self, rays: RayBatch, level: Level) -> None:
         """The rays of a level as the cameras now look."""
         if self.refines:
-            aim(rays, self.given[level.halvings], self.motion)
+            Pinholes.of(self.given[level.halvings], rays.pixels.device).aim(rays, self.motion)
 
     def motions(self) -> dict[str, list[float]]:
         """The same by the cameras' names; none where the calibration stands."""
-        named = zip(self.pictures[0].names, self.motion.tolist(), strict=True)
+        named = zip(self.pictures[0].names, self.motion.cpu().tolist(), strict=True)
         return {name: motion for name, motion in named if any(motion)}
 
     def look_again(self) -> None:
@@ -228,8 +228,13 @@ def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: F
     gains = settings.gains != "off"
     given = [picture.cameras for picture in pictures]
     motion = torch.zeros(len(capture), 4, dtype=torch.float64, device=settings.device)
-    refines = settings.refine != "off"
+    refines = may_refine(settings, halvings)
     return Studio(pictures, backdrop, equal, gains, per_channel, generator, floor, given, motion, refines)
+
+
+def may_refine(settings: FitSettings, halvings: int) -> bool:
+    """Whether cameras are refined until there is evidence: not where there is no coarser level to find it on."""
+    return settings.refine != "off" and halvings > 0
 
 
 def next_stage(stage: Stage, settings: FitSettings, plan: list[Level], studio: Studio) -> Stage:
