@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.ops import TILE
 from torch_surfcap.report import DPI, Path
-from torch_surfcap.surface.section import INSIDE_COLOR, OUTSIDE_COLOR, Section, cut
+from torch_surfcap.surface.section import INSIDE_COLOR, OUTSIDE_COLOR, Section, cut, in_words
 
 if TYPE_CHECKING:
     from torch_surfcap.field.field import SurfaceField
@@ -54,7 +54,7 @@ def write_section(
     left.add_patch(Rectangle(corner, width, width, fill=False, edgecolor=FRAME, linewidth=1.5))
     for side in right.spines.values():
         side.set(edgecolor=FRAME, linewidth=1.5)
-    left.set_title(f"{'xyz'[axis]} = {position:.4g}, voxel {field.voxel_size:.3g}")
+    left.set_title(f"{'xyz'[axis]} = {in_words(position, field.voxel_size)}, voxel {field.voxel_size:.3g}")
     right.set_title("detail")
     figure.legend(
         handles=[

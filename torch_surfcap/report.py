@@ -19,6 +19,7 @@ from torch import Tensor
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.files import atomic_write
+from torch_surfcap.data.geometry import export_mesh
 from torch_surfcap.distance import SurfaceDistance
 from torch_surfcap.fitting.color_gain import Equations, Exposure
 from torch_surfcap.fitting.rays import WITHIN
@@ -216,9 +217,9 @@ def write_depth(path: Path, depth: Tensor, cameras: Cameras, i: int) -> None:
 
 
 def write_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
-    """PLY, GLB, OBJ or what else the suffix says and trimesh writes."""
+    """PLY, GLB, OBJ or what else the suffix says and trimesh writes, see `export_mesh`."""
     with atomic_write(path) as partial:
-        mesh.export(str(partial))
+        export_mesh(partial, mesh)
 
 
 def write_history(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -41,7 +41,7 @@ from torch_surfcap.movie import film_suffix, write_film
 from torch_surfcap.pictures import KINDS, Subject
 from torch_surfcap.run import read_run
 from torch_surfcap.surface.render import mesh_depth
-from torch_surfcap.surface.section import middle_plane
+from torch_surfcap.surface.section import in_words, middle_plane
 from torch_surfcap.surface.turntable import turntable, up_direction
 
 Item = TypeVar("Item")
@@ -88,7 +88,8 @@ def render(options: argparse.Namespace) -> list[Path]:
         subject.errors, top = report.errors_of(mesh, read_mesh(Path(options.mesh_truth)), options.cut)
     out, written = run / report.PICTURES, []
     if "section" in kinds:
-        written.append(out / f"section_{'xyz'[axis]}_{position:.4g}.png")
+        where = in_words(position, field.voxel_size)
+        written.append(out / f"section_{'xyz'[axis]}_{where}.png")
         size = options.size or SECTION_SIZE
         write_section(written[-1], field, axis, position, size, up, config.mesh.threshold)
     if views is not None:

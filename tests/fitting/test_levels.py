@@ -63,9 +63,8 @@ def test_first_field_holds_the_ball(opacity: str, degree: int) -> None:
     solid = store[..., 0] < (0.0 if opacity == "distance" else 0.99)
     assert solid[radius < RADIUS].all()
     assert not solid[radius > 1.15 * RADIUS + 3 * voxel].any()  # twelve views leave corners on the hull
-    assert field.sample_opacity(center[None]).item() == (
-        -CLAMP if opacity == "distance" else pytest.approx(FOG)
-    )
+    deep = -CLAMP if opacity == "distance" else FOG
+    assert field.sample_opacity(center[None]).item() == pytest.approx(deep)
     if opacity == "distance":
         vertices = torch.from_numpy(field.extract_mesh().vertices)
         reach = (vertices - center).norm(dim=1) - RADIUS

@@ -83,15 +83,19 @@ class Cameras:
     @property
     def centers(self) -> Tensor:
         """[N,3] camera centres in world units."""
-        R, t = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3:]
-        return -(R.transpose(1, 2) @ t)[:, :, 0]
+        R, t = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
+        # Not -R^T t: text files round R, and far from the world's origin that would move the centre.
+        return -torch.linalg.solve(R, t)
 
-    def pinhole(self, i: int, device: torch.device | str = "cpu") -> PinholeCamera:
-        """Camera i as kornia's PinholeCamera (batch of one), for points on a device."""
-        intrinsics = torch.eye(4, dtype=torch.float64)
+    def pinhole(self, i: int, device: torch.device | str = "cpu", at_origin: bool = False) -> PinholeCamera:
+        """Camera i, or one that stands at the origin and looks the same way, as kornia's PinholeCamera (batch of one), for
+        points on a device."""
+        intrinsics, pose = torch.eye(4, dtype=torch.float64), self.world_to_camera[i].clone()
         intrinsics[:3, :3] = self.K[i]
+        if at_origin:
+            pose[:3, 3] = 0.0
         width, height = self.size[i, 0:1], self.size[i, 1:2]
-        camera = (intrinsics[None], self.world_to_camera[i : i + 1], height, width)
+        camera = (intrinsics[None], pose[None], height, width)
         return PinholeCamera(*(part.to(device) for part in camera))
 
     def projection_matrices(self) -> Tensor:
@@ -124,9 +128,18 @@ class Cameras:
         The rays are made on the pixels' device.
         """
         uv = self.pixels(i) if pixels is None else pixels.to(torch.float64).reshape(-1, 2)
-        points = self.pinhole(i, uv.device).unproject(uv[None], uv.new_ones(1, len(uv), 1))[0]
+        # The difference of two points far from the origin would have few digits left.
+        towards = self.pinhole(i, uv.device, at_origin=True).unproject(uv[None], uv.new_ones(1, len(uv), 1))[
+            0
+        ]
         origins = self.centers[i].to(uv.device).expand(len(uv), 3)
-        return origins, torch.nn.functional.normalize(points - origins, dim=-1)
+        return origins, torch.nn.functional.normalize(towards, dim=-1)
+
+    def moved(self, shift: Tensor) -> Cameras:
+        """The cameras in a world whose points have all moved by `shift` [3], world units."""
+        poses = self.world_to_camera.clone()
+        poses[:, :3, 3] -= poses[:, :3, :3] @ shift
+        return Cameras(self.K, poses, self.size)
 
     def subset(self, indices: Sequence[int] | Tensor) -> Cameras:
         """The cameras at `indices`, in that order."""

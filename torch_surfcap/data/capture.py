@@ -133,6 +133,12 @@ class Capture:
         images, masks, plates = pictures
         return self._with(images or [], masks, plates, self.names, self.cameras)
 
+    def moved(self, shift: Tensor) -> Capture:
+        """The same views, held-out ones too, in a world whose points have all moved by `shift` [3]."""
+        moved = self._with(self.images, self.masks, self.plates, self.names, self.cameras.moved(shift))
+        moved.test = self.test and self.test.moved(shift)
+        return moved
+
     @property
     def nbytes(self) -> int:
         """Of images, masks and plates."""

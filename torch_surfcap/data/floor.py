@@ -8,7 +8,7 @@ everywhere: it is the plane on which all cameras agree about what is where.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -42,6 +42,10 @@ class Floor:
     def height(self, points: Tensor) -> Tensor:
         """Of points [..., 3] above the floor, [...] float64."""
         return points.double() @ self.normal.to(points.device) - self.offset
+
+    def moved(self, shift: Tensor) -> Floor:
+        """The floor of a world whose points have all moved by `shift` [3]."""
+        return replace(self, offset=self.offset + float(self.normal @ shift))
 
 
 def find_floor(capture: Capture, box: tuple[Tensor, Tensor]) -> Floor | None:

@@ -6,6 +6,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -93,10 +94,10 @@ class SurfaceField(nn.Module):
         self.origin: Tensor
         self.register_buffer("table", grid.table.to(voxels.device), persistent=False)
         self.register_buffer("tile_coords", grid.coords.to(voxels.device), persistent=False)
+        self._corner = grid.origin
         corner = torch.tensor(grid.origin, dtype=torch.float64, device=voxels.device)
         self.register_buffer("origin", corner, persistent=False)
-        self._corner = grid.origin  # the buffer takes the module's precision, this one stays exact
-        self._frame = grid.frame(self.outside, self.inside)
+        self._frame = replace(grid, origin=(0.0, 0.0, 0.0)).frame(self.outside, self.inside)  # see `_own`
 
     @classmethod
     def from_dense(
@@ -140,8 +141,8 @@ class SurfaceField(nn.Module):
 
     @property
     def frame(self) -> list[float]:
-        """The ``frame`` argument of the ops."""
-        return self._frame
+        """The ``frame`` argument of the ops, for positions in the world."""
+        return self.grid.frame(self.outside, self.inside)
 
     @property
     def transparency(self) -> Tensor:
@@ -179,7 +180,7 @@ class SurfaceField(nn.Module):
         Differentiability: voxels (and those of ``view``) and background.
         """
         dtype, device = self.voxels.dtype, self.voxels.device
-        origins, directions = origins.to(device, dtype), directions.to(device, dtype)
+        origins, directions = self._own(origins), directions.to(device, dtype)
         if background is None:
             background = torch.zeros_like(origins)
         if shift is None:
@@ -190,14 +191,13 @@ class SurfaceField(nn.Module):
             store, background.to(device, dtype), self.table, self._frame, *rays, self.march(step)
         )
         if self.view is not None:
-            points = origins + depth.detach().nan_to_num(0.0)[:, None] * directions
+            points = self.origin + origins + depth.detach().nan_to_num(0.0)[:, None] * directions
             color = color + (1 - transmittance)[:, None] * self.view.sample(points, directions)[1]
         return RayOutput(color, transmittance, depth)
 
     def sample_opacity(self, points: Tensor) -> Tensor:
         """The raw opacity value at ``points [P, 3]``: [P], differentiable."""
-        points = points.to(self.voxels.device, self.voxels.dtype)
-        values: Tensor = SampleTiles.apply(self._store(), self.table, self._frame, points)
+        values: Tensor = SampleTiles.apply(self._store(), self.table, self._frame, self._own(points))
         return values[:, 0]
 
     def sample(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -206,8 +206,8 @@ class SurfaceField(nn.Module):
         The transparency of a signed distance s is that of a long step that ends there, 1/(1 + exp(-slope s)): 1 outside,
         0 inside. Differentiability: voxels, and those of ``view``.
         """
-        points, directions = (x.to(self.voxels.device, self.voxels.dtype) for x in (points, directions))
-        values = ShadePoints.apply(self._store(), self.table, self._frame, points, directions)
+        directions = directions.to(self.voxels.device, self.voxels.dtype)
+        values = ShadePoints.apply(self._store(), self.table, self._frame, self._own(points), directions)
         opacity, color = values[:, 0], values[:, 1:]
         if self.opacity == "distance":
             opacity = torch.sigmoid(SLOPE * opacity)
@@ -215,18 +215,24 @@ class SurfaceField(nn.Module):
             color = color + self.view.sample(points, directions)[1]
         return opacity, color
 
+    def _own(self, points: Tensor) -> Tensor:
+        """World positions relative to the field's own origin, so near that the voxels' precision resolves them."""
+        return (points.to(self.origin) - self.origin).to(self.voxels.dtype)
+
     def _padded(self, voxels: Tensor) -> Tensor:
         """The coefficients in memory that is padded to a record's pitch, so that no op has to copy them."""
         return ops.padded(voxels).contiguous()[..., : ops.coefficients(self.sh_degree)]
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Any:
-        """What ``to`` and its like do: their copies of the parameter are padded again."""
+        """What ``to`` and its like do: their copies of the parameter are padded again, and the origin stays exact."""
 
         def moved(tensor: Tensor) -> Any:
             copy = fn(tensor)
             return self._padded(copy) if tensor is self.voxels and copy.stride() != self._strides() else copy
 
-        return super()._apply(moved, recurse)
+        super()._apply(moved, recurse)
+        self.origin = torch.tensor(self._corner, dtype=torch.float64, device=self.origin.device)
+        return self
 
     def _strides(self) -> tuple[int, ...]:
         """Those of padded memory."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -85,6 +85,11 @@ class TileGrid:
         """The ``frame`` argument of the ops."""
         edge = TILE * self.voxel_size
         return [*(o - edge for o in self.origin), self.voxel_size, outside, inside]
+
+    def moved(self, shift: Tensor) -> TileGrid:
+        """The same tiles in a world whose points have all moved by ``shift`` [3]."""
+        x, y, z = (o + s for o, s in zip(self.origin, shift.tolist(), strict=True))
+        return replace(self, origin=(x, y, z))
 
     def to(self, device: torch.device | str) -> TileGrid:
         return TileGrid(self.table.to(device), self.coords.to(device), self.origin, self.voxel_size)

@@ -12,9 +12,10 @@ from torch import Tensor
 from torch_surfcap import devices, ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import leave_out, prepare
-from torch_surfcap.data.floor import find_floor
+from torch_surfcap.data.floor import Floor, find_floor
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SurfaceField
+from torch_surfcap.field.tiles import TileGrid
 from torch_surfcap.fitting import alignment, outliers
 from torch_surfcap.fitting.budget import Budget, estimate, lack, shortage
 from torch_surfcap.fitting.checkpoint import Checkpoints, Record, Saved
@@ -131,14 +132,14 @@ def _fit(
     watch.lap("box")
     floor = find_floor(capture, box) if s.floor == "auto" else None
     watch.lap("floor")
-    studio = open_studio(capture, s, plan[0].halvings, floor)
+    studio = open_studio(capture, s, plan[0].halvings, floor, origin=(box[0] + box[1]) / 2)
     so_far = Record(list(capture.warnings)) if saved is None else Record(**saved.plain["record"])
     so_far.left_out = left_out | so_far.left_out
     run = _Run(s, capture, box, plan, studio, so_far, saved, checkpoints, report)
     resumed = len(so_far.history)
     outcome = run.outcome(watch)
     watch.lap("fit")
-    surface = outcome.surface(s.opacity, floor)
+    surface = outcome.surface(s.opacity, studio)
     mesh = surface.extract_mesh(s.threshold, s.smooth, s.specks)
     watch.lap("mesh")
     if len(mesh.faces) == 0:
@@ -153,7 +154,7 @@ def _fit(
         so_far.history,
         exposure.gain,
         exposure.bias,
-        _chosen(s, box, outcome, plan, studio, so_far),
+        _chosen(s, box, floor, outcome, plan, studio, so_far),
         seconds,
         so_far.warnings,
         None if saved is None else saved.place,
@@ -227,7 +228,7 @@ class _Run:
             stage = self.saved.stage(s, plan, studio)
             watch.lap("resume")
             return stage
-        grid, store = first_field(studio.pictures[-1], self.box, plan[0].voxel_size, s, studio.floor)
+        grid, store = self._first_field(studio.pictures[-1])
         watch.lap("hull")
         budget = estimate(self.capture, plan, grid, store, s)
         so_far.level_bytes = budget.level_bytes
@@ -237,6 +238,11 @@ class _Run:
             raise InputError(f"memory: {missing}")
         studio.keep_pictures(s.images, so_far.level_bytes)
         return begin_stage(s, plan, 0, grid, store, studio)
+
+    def _first_field(self, pictures: Capture) -> tuple[TileGrid, Tensor]:
+        """Of the coarsest level, out of the hull of its pictures."""
+        low, high = (corner - self.studio.origin for corner in self.box)
+        return first_field(pictures, (low, high), self.plan[0].voxel_size, self.settings, self.studio.floor)
 
     def _again(self) -> Stage:
         """The first level anew, done, without the cameras that were left out after one: what they carved off the hull, no
@@ -251,7 +257,7 @@ class _Run:
         coarsest, names = self.plan[0], self.capture.names
         left = [i for i, name in enumerate(names) if name not in so_far.left_out]
         pictures = self.studio.pictures[coarsest.halvings].subset(left)
-        grid, store = first_field(pictures, self.box, coarsest.voxel_size, s, self.studio.floor)
+        grid, store = self._first_field(pictures)
         stage = begin_stage(s, self.plan, 0, grid, store, self.studio)
         self._save(stage)
         self._descend(stage)
@@ -329,6 +335,7 @@ class _Run:
 def _chosen(
     s: FitSettings,
     box: tuple[Tensor, Tensor],
+    floor: Floor | None,
     outcome: Outcome,
     plan: list[Level],
     studio: Studio,
@@ -360,8 +367,8 @@ def _chosen(
             "reason": "all that agree" if s.reject == "auto" else "all, as given",
         },
         "floor": {
-            "value": studio.floor and [*studio.floor.normal.tolist(), studio.floor.offset],
-            "reason": "off" if s.floor == "off" else "plates" if studio.floor else "none seen",
+            "value": floor and [*floor.normal.tolist(), floor.offset],
+            "reason": "off" if s.floor == "off" else "plates" if floor else "none seen",
         },
         "mask": {"value": s.losses.mask, "reason": f"silhouettes by {studio.pictures[0].mask_source}"},
         "gains": {

@@ -31,6 +31,9 @@ PICTURES_SHARE = 0.8  # of the device's memory that the largest level leaves, fo
 class Studio:
     """What does not belong to one level: the photographs at every size and the cameras' exposure.
 
+    In it all positions, those of cameras, floor and grids, are relative to a place in the world, ``origin`` [3] float64,
+    near the subject: rays are in single precision, which far from the world's origin would tell no voxel from the next.
+
     pictures: the capture, halved 0, 1, ... times. backdrop: see ``RayBatch.expose``. generator: of the lattices' shifts.
     gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera. floor: below
     which nothing is, where one was found. given: the cameras of the pictures, as calibrated. motion: [N, 4] by which their
@@ -44,6 +47,7 @@ class Studio:
     per_channel: bool
     generator: torch.Generator
     floor: Floor | None
+    origin: Tensor
     given: list[Cameras]
     motion: Tensor
     refines: bool
@@ -162,10 +166,11 @@ class Outcome:
         cut_at_floor(self.grid, store, opacity, floor)
         return store
 
-    def surface(self, opacity: str, floor: Floor | None) -> SurfaceField:
-        """As a module."""
-        view = self.view and SurfaceField(self.view[1], self.view[0], KIND)
-        return SurfaceField(self.decoded(opacity, floor), self.grid, opacity, self.step, view)
+    def surface(self, opacity: str, studio: Studio) -> SurfaceField:
+        """As a module, where it is in the world."""
+        view = self.view and SurfaceField(self.view[1], self.view[0].moved(studio.origin), KIND)
+        grid = self.grid.moved(studio.origin)
+        return SurfaceField(self.decoded(opacity, studio.floor), grid, opacity, self.step, view)
 
 
 def rendered(stage: Stage, settings: FitSettings) -> Tensor:
@@ -215,9 +220,16 @@ def begin_stage(
     return Stage(number, level, grid, store, march, rays, adam, rule, view=view)
 
 
-def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: Floor | None = None) -> Studio:
-    """The pictures down to so many halvings, all exposed as they are."""
-    pictures = [capture]
+def open_studio(
+    capture: Capture,
+    settings: FitSettings,
+    halvings: int,
+    floor: Floor | None = None,
+    origin: Tensor | None = None,
+) -> Studio:
+    """The pictures down to so many halvings, all exposed as they are. origin: of the studio, by default the world's."""
+    origin = torch.zeros(3, dtype=torch.float64) if origin is None else origin
+    pictures = [capture.moved(-origin)]
     while len(pictures) <= halvings:
         pictures.append(pictures[-1].halved())
     generator = torch.Generator(settings.device).manual_seed(settings.seed)
@@ -226,10 +238,13 @@ def open_studio(capture: Capture, settings: FitSettings, halvings: int, floor: F
     backdrop = None if backdrop is None else backdrop.to(settings.device)
     per_channel = settings.gain_per == "channel"
     gains = settings.gains != "off"
+    floor = floor and floor.moved(-origin)
     given = [picture.cameras for picture in pictures]
     motion = torch.zeros(len(capture), 4, dtype=torch.float64, device=settings.device)
     refines = may_refine(settings, halvings)
-    return Studio(pictures, backdrop, equal, gains, per_channel, generator, floor, given, motion, refines)
+    return Studio(
+        pictures, backdrop, equal, gains, per_channel, generator, floor, origin, given, motion, refines
+    )
 
 
 def may_refine(settings: FitSettings, halvings: int) -> bool:

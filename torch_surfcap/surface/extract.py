@@ -207,11 +207,10 @@ def vertex_colors(field: SurfaceField, mesh: trimesh.Trimesh) -> NDArray[np.uint
     """Colours [V, 4] (RGBA, 8 bit) of the field at a mesh's vertices, seen along the normal from outside."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     inward = -vertex_normals(vertices, np.asarray(mesh.faces, dtype=np.int64))
-    like = field.voxels
     colors = np.full((len(vertices), 4), 255, dtype=np.uint8)
     with torch.no_grad():
         for s in range(0, len(vertices), CHUNK):
-            at, towards = (torch.from_numpy(x[s : s + CHUNK]).to(like) for x in (vertices, inward))
+            at, towards = (torch.from_numpy(x[s : s + CHUNK]) for x in (vertices, inward))
             rgb = field.sample(at, towards)[1].clamp(0, 1).cpu().numpy()
             colors[s : s + CHUNK, :3] = np.rint(255 * rgb)
     return colors

@@ -106,7 +106,11 @@ def first_faces(
     if device.type != "cpu":
         return z_buffer(mesh, cameras, i, device).flatten()[pixels].numpy().astype(np.int64)
     origins, directions = (x.numpy() for x in pixel_rays(cameras, i, pixels))
-    return np.asarray(mesh.ray.intersects_first(origins, directions), dtype=np.int64)
+    first = np.full(len(pixels), -1)
+    # Not `intersects_first`, which rounds the origins to single precision, however far from them the mesh is.
+    face, ray = mesh.ray.intersects_id(origins, directions, multiple_hits=False)
+    first[ray] = face
+    return first
 
 
 def z_buffer(mesh: trimesh.Trimesh, cameras: Cameras, i: int, device: torch.device) -> Tensor:
@@ -135,9 +139,7 @@ def raster(
     colors = torch.zeros(len(hits.pixel), 3)
     with torch.no_grad():
         for s in range(0, len(colors), CHUNK):
-            at, towards = (
-                torch.from_numpy(x[s : s + CHUNK]).to(field.voxels) for x in (hits.point, hits.direction)
-            )
+            at, towards = (torch.from_numpy(x[s : s + CHUNK]) for x in (hits.point, hits.direction))
             colors[s : s + CHUNK] = field.sample(at, towards)[1].cpu().float()
     return hits.picture(colors, backdrop(background, hits.size))
 

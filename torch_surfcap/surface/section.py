@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -79,6 +80,11 @@ def middle_plane(mesh: trimesh.Trimesh) -> tuple[int, float]:
     return axis, float(np.median(vertices[:, axis]))
 
 
+def in_words(position: float, voxel_size: float) -> str:
+    """A position along an axis, as precisely as voxels of this size tell it."""
+    return np.format_float_positional(position, max(0, 1 - math.floor(math.log10(voxel_size))), trim="-")
+
+
 def cut(
     field: SurfaceField,
     axis: int,
@@ -109,8 +115,9 @@ def cut(
     occupied = (layer > OUTSIDE).nonzero()
     if len(occupied) == 0:
         reach = frame[axis] + edge * np.flatnonzero((table > OUTSIDE).transpose(0, axis).flatten(1).any(1))
-        there = f"{reach[0]:.4g} to {reach[-1] + edge:.4g}" if len(reach) else "a field that is not empty"
-        raise InputError(f"section: no tile of the field at {'xyz'[axis]}={position:g}, expected {there}")
+        ends = [in_words(end, field.voxel_size) for end in (position, *reach[:1], *(reach[-1:] + edge))]
+        there = " to ".join(ends[1:]) or "a field that is not empty"
+        raise InputError(f"section: no tile of the field at {'xyz'[axis]}={ends[0]}, expected {there}")
     if around is None:
         first, last = (x.double().numpy() for x in (occupied.amin(0) - 1, occupied.amax(0) + 2))
         low, span = frame[[across, upward]] + edge * first, edge * (last - first)
