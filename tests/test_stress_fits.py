@@ -62,7 +62,7 @@ def test_nothing_ends_in_silence(
     assert result["outcome"] == "refused" or math.isfinite(result["chamfer"])
 
 
-@pytest.mark.parametrize("title", ["unit mm", "far away 1 km", "rotated", "permuted"])
+@pytest.mark.parametrize("title", ["unit mm", "far away 100 km", "rotated", "permuted"])
 def test_what_changes_nothing(
     clean: tuple[Path, trimesh.Trimesh, dict[str, Any]], title: str, tmp_path: Path
 ) -> None:

@@ -30,6 +30,7 @@ from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.hull import find_box
+from torch_surfcap.surface.section import in_words
 
 FILLED = 0.95  # less than this share of the silhouettes filled on average is a finding
 FILLED_ONE = 0.85  # ... and less than this of one camera's
@@ -169,7 +170,8 @@ def show(check: Check) -> None:
             f"{row['brightness']:>10.3f}  {row['exposure']:>8.2f}"
         )
     if check.box is not None:
-        low, high = (" ".join(f"{x:.4g}" for x in corner.tolist()) for corner in check.box)
+        length = 1e-2 * float((check.box[1] - check.box[0]).max())
+        low, high = (" ".join(in_words(x, length) for x in corner.tolist()) for corner in check.box)
         print(f"box: {low} to {high}")
     if check.agreement is not None:
         print(f"the hull fills {check.agreement.mean:.4f} of the silhouettes")

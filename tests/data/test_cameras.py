@@ -49,6 +49,23 @@ def test_centers_project_nowhere() -> None:
         assert abs(float(depth)) < 1e-12
 
 
+def test_far_from_the_origin() -> None:
+    """Cameras that stand 100 km away, with rotations as text files round them, are the same ones at the origin."""
+    cameras, shift = rig_cameras(), torch.tensor([6e4, -6.4e4, 4.8e4], dtype=torch.float64)
+    to_world = torch.linalg.inv(cameras.world_to_camera)
+    to_world[:, :3, :3] = to_world[:, :3, :3].mul(1e5).round() / 1e5
+    near = Cameras(cameras.K, torch.linalg.inv(to_world), cameras.size)
+    to_world[:, :3, 3] += shift
+    far = Cameras(cameras.K, torch.linalg.inv(to_world), cameras.size)
+    for i in range(len(near)):
+        (origins, directions), (start, towards) = far.rays(i), near.rays(i)
+        torch.testing.assert_close(origins - shift, start, rtol=0, atol=1e-9)
+        torch.testing.assert_close(directions, towards, rtol=0, atol=1e-12)
+        uv, _ = far.project(i, origins + 3 * directions)
+        torch.testing.assert_close(uv, near.pixels(i), rtol=0, atol=1e-6)
+    torch.testing.assert_close(far.moved(-shift).world_to_camera, near.world_to_camera, rtol=0, atol=1e-9)
+
+
 def test_half_of_a_camera_sees_the_mean_of_pixels() -> None:
     cameras = rig_cameras()
     half = cameras.scaled_half()

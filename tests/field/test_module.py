@@ -160,7 +160,34 @@ def test_conversion_moves_nothing(opacity: str) -> None:
     origin = [1234.56789, -0.1, 77.7]
     field = SurfaceField.from_dense(value, torch.ones(8, 8, 8, 3), origin, 0.01, opacity)
     assert field.half().double().grid.origin == tuple(origin)
+    assert field.half().origin.tolist() == origin
     assert field.frame[:3] == [o - 0.04 for o in origin]
+
+
+@BOTH
+def test_single_precision_far_from_the_origin(opacity: str) -> None:
+    """100 km away a field of voxels of 0.25 looks as it does at the origin, its view-dependent part too."""
+    shift = torch.tensor([6e4, -6.4e4, 4.8e4], dtype=torch.float64)
+    plain, view = random_field(0, opacity, torch.float32), random_field(2, "distance", torch.float32)
+    coarse = TileGrid(view.table, view.tile_coords, (-1.2, 0.3, 1.9), 2 * view.voxel_size)
+    near, far = (
+        SurfaceField(
+            plain.voxels,
+            plain.grid.moved(by),
+            opacity,
+            plain.step,
+            SurfaceField(view.voxels, coarse.moved(by), "distance"),
+        )
+        for by in (0 * shift, shift)
+    )
+    origins, directions = some_rays(near, 200)
+    points = origins + 3 * directions
+    with torch.no_grad():
+        here = (*near(origins, directions), *near.sample(points, directions), near.sample_opacity(points))
+        origins, points = origins + shift, points + shift
+        there = (*far(origins, directions), *far.sample(points, directions), far.sample_opacity(points))
+    for one, two in zip(here, there, strict=True):
+        torch.testing.assert_close(two, one, rtol=0, atol=1e-4, equal_nan=True)
 
 
 def test_a_field_trusts_no_table() -> None:

@@ -19,6 +19,8 @@ from torch_surfcap.fitting import fit as fit_function
 from torch_surfcap.fitting.budget import estimate, shortage
 from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
 from torch_surfcap.fitting.settings import FitSettings
+from torch_surfcap.metrics import surface_scores
+from torch_surfcap.report import score_views
 
 QUICK: dict[str, Any] = {"levels": 2, "voxel": 1 / 40}
 
@@ -91,6 +93,20 @@ def test_plates_are_the_background(images: str, device: str) -> None:
     capture = ball(8, 32, plates=True)
     result = fit(capture, sh_degree=0, levels=1, voxel=0.05, images=images, device=device)
     assert np.abs(errors(result.mesh)).max() < 2 * 0.05
+
+
+def test_the_world_may_lie_anywhere() -> None:
+    """The mesh of a subject 100 km from the origin is that of the subject at the origin, and shows as much."""
+    capture, shift = ball(8, 32), torch.tensor([6e4, -6.4e4, 4.8e4], dtype=torch.float64)
+    away = capture.moved(shift)
+    settings: dict[str, Any] = {"levels": 2, "voxel": 0.05, "sh_degree": 1, "view_spacing": 4}
+    near, far = (fit(c, **settings) for c in (capture, away))
+    moved = far.mesh.copy().apply_translation(-shift.numpy())
+    assert surface_scores(moved, near.mesh, samples=20_000)["chamfer"] < 0.02 * 0.05
+    corners = torch.tensor([r.chosen["box"]["value"] for r in (near, far)], dtype=torch.float64)
+    torch.testing.assert_close(corners[1] - shift.repeat(2), corners[0], rtol=0, atol=1e-6)
+    scores = [score_views(r.field, r.mesh, c, [0]) for r, c in ((near, capture), (far, away))]
+    assert scores[1] == pytest.approx(scores[0], rel=1e-3)
 
 
 def same(one: FitResult, two: FitResult) -> bool:

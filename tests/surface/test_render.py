@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from tests.surface.shapes import CENTER, RADIUS, VOXEL, ball_distance, field_of, signed
+from tests.surface.shapes import CENTER, RADIUS, VOXEL, ball_distance, colors_of, field_of, signed
 from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.field.field import SurfaceField
 from torch_surfcap.surface.extract import extract_mesh
@@ -148,6 +148,25 @@ def test_volume_equals_the_field_on_all_rays(field: SurfaceField, cameras: Camer
     with torch.no_grad():
         direct = field(origins, directions, background=torch.full_like(origins, 0.3)).color
     torch.testing.assert_close(volume(field, cameras, 1, 0.3), direct.reshape(HEIGHT, WIDTH, 3))
+
+
+def test_far_from_the_origin(
+    field: SurfaceField, mesh: trimesh.Trimesh, cameras: Cameras, device: str
+) -> None:
+    """All pictures of the ball 100 km away are those of the ball at the origin, but for centres on an edge of the mesh."""
+    shift = torch.tensor([6e4, -6.4e4, 4.8e4], dtype=torch.float64)
+    far = SurfaceField(field.voxels, field.grid.moved(shift), field.opacity, field.step)
+    there, places = extract_mesh(far), cameras.moved(shift)
+    np.testing.assert_allclose(there.vertices - shift.numpy(), mesh.vertices, rtol=0, atol=1e-9)
+    assert (colors_of(there) == colors_of(mesh)).mean() > 0.999
+    for one, two in (
+        (volume(field, cameras, 0, WHITE), volume(far, places, 0, WHITE)),
+        (raster(field, mesh, cameras, 0, WHITE), raster(far, there, places, 0, WHITE)),
+        (shaded(mesh, cameras, 0), shaded(there, places, 0)),
+        (mesh_depth(mesh, cameras, 0).nan_to_num(0.0), mesh_depth(there, places, 0).nan_to_num(0.0)),
+        *((z_buffer(m, c, 0, torch.device(device)) for m, c in ((mesh, cameras), (there, places))),),
+    ):
+        assert ((one - two).abs() > 1e-4).float().mean() < 0.002
 
 
 def test_no_mesh_shows_the_background(field: SurfaceField, cameras: Cameras) -> None:

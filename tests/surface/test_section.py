@@ -10,7 +10,7 @@ import trimesh
 from tests.surface.shapes import CENTER, RADIUS, VOXEL, ball, ball_distance, field_of, signed
 from torch_surfcap.errors import InputError
 from torch_surfcap.field.field import SLOPE, SurfaceField
-from torch_surfcap.surface.section import INSIDE_COLOR, OUTSIDE_COLOR, cut, middle_plane
+from torch_surfcap.surface.section import INSIDE_COLOR, OUTSIDE_COLOR, cut, in_words, middle_plane
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +60,11 @@ def test_orientation(
     assert section.picture()[inside].tolist() == pytest.approx(INSIDE_COLOR)
     corners = [[{0: 10, 1: y}[axis] for axis in axes] for y in (20, 22, 24)]
     assert sorted(section.stored.tolist()) == corners
+
+
+def test_positions_in_words() -> None:
+    assert [in_words(x, 0.02) for x in (0.1, -0.01234, 60000.12345)] == ["0.1", "-0.012", "60000.123"]
+    assert in_words(-64000123.4, 20.0) == "-64000123"
 
 
 @pytest.mark.parametrize("position", [29.9, 36.1, 100, -100])

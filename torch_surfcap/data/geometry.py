@@ -53,8 +53,10 @@ def export_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
 
 def _double_ply(mesh: trimesh.Trimesh) -> bytes:
     """Binary PLY of the vertices in double precision, their colours, where they have some, and the faces."""
-    count, colored = [len(mesh.vertices), len(mesh.faces)], mesh.visual.kind == "vertex"
-    colors = mesh.visual.vertex_colors if colored else np.empty((count[0], 0), np.uint8)
+    count, visual = (len(mesh.vertices), len(mesh.faces)), mesh.visual
+    colors = np.empty((count[0], 0), np.uint8)
+    if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
+        colors = visual.vertex_colors
     at = np.ascontiguousarray(mesh.vertices, "<f8").view(np.uint8)
     corners = np.ascontiguousarray(mesh.faces, "<i4").view(np.uint8)
     header = [

@@ -6,7 +6,6 @@ import os
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -97,7 +96,7 @@ class SurfaceField(nn.Module):
         self._corner = grid.origin
         corner = torch.tensor(grid.origin, dtype=torch.float64, device=voxels.device)
         self.register_buffer("origin", corner, persistent=False)
-        self._frame = replace(grid, origin=(0.0, 0.0, 0.0)).frame(self.outside, self.inside)  # see `_own`
+        self._frame = grid.frame(self.outside, self.inside, about=grid.origin)  # see `_own`
 
     @classmethod
     def from_dense(
@@ -179,16 +178,15 @@ class SurfaceField(nn.Module):
 
         Differentiability: voxels (and those of ``view``) and background.
         """
-        dtype, device = self.voxels.dtype, self.voxels.device
-        origins, directions = self._own(origins), directions.to(device, dtype)
+        origins, directions = self._own(origins), directions.to(self.voxels)
         if background is None:
             background = torch.zeros_like(origins)
         if shift is None:
             shift = origins.new_zeros(len(origins))
         store = self._store()
-        rays = (origins, directions, shift.to(device, dtype))
+        rays = (origins, directions, shift.to(origins))
         color, transmittance, depth = MarchRays.apply(
-            store, background.to(device, dtype), self.table, self._frame, *rays, self.march(step)
+            store, background.to(origins), self.table, self._frame, *rays, self.march(step)
         )
         if self.view is not None:
             points = self.origin + origins + depth.detach().nan_to_num(0.0)[:, None] * directions
@@ -206,7 +204,7 @@ class SurfaceField(nn.Module):
         The transparency of a signed distance s is that of a long step that ends there, 1/(1 + exp(-slope s)): 1 outside,
         0 inside. Differentiability: voxels, and those of ``view``.
         """
-        directions = directions.to(self.voxels.device, self.voxels.dtype)
+        directions = directions.to(self.voxels)
         values = ShadePoints.apply(self._store(), self.table, self._frame, self._own(points), directions)
         opacity, color = values[:, 0], values[:, 1:]
         if self.opacity == "distance":
@@ -228,11 +226,11 @@ class SurfaceField(nn.Module):
 
         def moved(tensor: Tensor) -> Any:
             copy = fn(tensor)
+            if tensor is self.origin:
+                return tensor.to(copy.device)
             return self._padded(copy) if tensor is self.voxels and copy.stride() != self._strides() else copy
 
-        super()._apply(moved, recurse)
-        self.origin = torch.tensor(self._corner, dtype=torch.float64, device=self.origin.device)
-        return self
+        return super()._apply(moved, recurse)
 
     def _strides(self) -> tuple[int, ...]:
         """Those of padded memory."""

@@ -81,10 +81,13 @@ class TileGrid:
         """[X, Y, Z] bool: missing tiles that are inside."""
         return self.table[1:-1, 1:-1, 1:-1] == INSIDE
 
-    def frame(self, outside: float, inside: float) -> list[float]:
-        """The ``frame`` argument of the ops."""
+    def frame(
+        self, outside: float, inside: float, about: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> list[float]:
+        """The ``frame`` argument of the ops, for positions relative to ``about``."""
         edge = TILE * self.voxel_size
-        return [*(o - edge for o in self.origin), self.voxel_size, outside, inside]
+        corner = (o - a - edge for o, a in zip(self.origin, about, strict=True))
+        return [*corner, self.voxel_size, outside, inside]
 
     def moved(self, shift: Tensor) -> TileGrid:
         """The same tiles in a world whose points have all moved by ``shift`` [3]."""

@@ -31,8 +31,8 @@ PICTURES_SHARE = 0.8  # of the device's memory that the largest level leaves, fo
 class Studio:
     """What does not belong to one level: the photographs at every size and the cameras' exposure.
 
-    In it all positions, those of cameras, floor and grids, are relative to a place in the world, ``origin`` [3] float64,
-    near the subject: rays are in single precision, which far from the world's origin would tell no voxel from the next.
+    In it all positions, those of cameras, floor and grids, are relative to a place near the subject, in the world ``origin``
+    [3] float64: rays are in single precision, which far from the world's origin would tell no voxel from the next.
 
     pictures: the capture, halved 0, 1, ... times. backdrop: see ``RayBatch.expose``. generator: of the lattices' shifts.
     gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera. floor: below

@@ -80,9 +80,9 @@ def middle_plane(mesh: trimesh.Trimesh) -> tuple[int, float]:
     return axis, float(np.median(vertices[:, axis]))
 
 
-def in_words(position: float, voxel_size: float) -> str:
-    """A position along an axis, as precisely as voxels of this size tell it."""
-    return np.format_float_positional(position, max(0, 1 - math.floor(math.log10(voxel_size))), trim="-")
+def in_words(position: float, length: float) -> str:
+    """A coordinate, to a tenth of a length or finer, however far from the origin."""
+    return np.format_float_positional(position, max(0, 1 - math.floor(math.log10(length))), trim="-")
 
 
 def cut(
