@@ -78,7 +78,7 @@ def conditions() -> list[Condition]:
         Condition(GROUP, "threads", "1", "One thread.", "same", threads=1),
         Condition(GROUP, "repeated", "", "The clean run once more.", "same"),
         *(
-            Condition(GROUP, "seed", f"{seed}", "Another seed.", "same", settings={"seed": seed})
+            Condition(GROUP, "seed", f"{seed}", "Another seed.", settings={"seed": seed})
             for seed in (1, 2)
         ),
     ]
