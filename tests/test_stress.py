@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,16 @@ from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import meeting_point
 from torch_surfcap.data.sample_scene import Coat
 from torch_surfcap.errors import InputError
-from torch_surfcap.studies.stress import calibration, capture, numbers, page, photometry, silhouettes, suite
+from torch_surfcap.studies.stress import (
+    calibration,
+    capture,
+    numbers,
+    page,
+    photometry,
+    silhouettes,
+    suite,
+    trial,
+)
 from torch_surfcap.studies.stress.condition import Condition
 from torch_surfcap.studies.stress.scene import WRONG, Scene, photographed, true_surface
 
@@ -59,6 +69,23 @@ def test_a_condition_leaves_its_input_alone_and_gives_another(spoilt: Condition,
     changed |= not torch.equal(other.cameras.K, tiny.cameras.K)
     changed |= not torch.equal(other.cameras.world_to_camera, tiny.cameras.world_to_camera)
     assert changed or spoilt.name in ("repeated", "threads") or spoilt.title == "views 30"
+
+
+def test_a_scene_on_disk(tiny: Capture, tmp_path: Path) -> None:
+    """Comes back as it was, pictures of unlike sizes too, and without a pickle."""
+    K, pose = tiny.cameras.K[:2], tiny.cameras.world_to_camera[:2]
+    assert tiny.masks is not None
+    odd = Capture([tiny.images[0][:, :48], tiny.images[1]], K, pose, [tiny.masks[0][:, :48], tiny.masks[1]])
+    for number, saved in enumerate((tiny, odd)):
+        trial._save(saved, tmp_path / f"{number}.npz")
+        back = trial._load(tmp_path / f"{number}.npz")
+        assert (back.plates is None, back.test is None) == (saved.plates is None, saved.test is None)
+        for a, b in ((back, saved), (back.test or back, saved.test or saved)):
+            assert torch.equal(a.cameras.K, b.cameras.K)
+            assert torch.equal(a.cameras.world_to_camera, b.cameras.world_to_camera)
+            for kind in ("images", "masks", "plates"):
+                pairs = zip(getattr(a, kind) or (), getattr(b, kind) or (), strict=True)
+                assert all(torch.equal(x, y) for x, y in pairs)
 
 
 def test_gains_multiply_photograph_and_plate_alike(tiny: Capture) -> None:

@@ -18,7 +18,6 @@ import trimesh
 from torch import Tensor
 
 from torch_surfcap import report, soundness
-from torch_surfcap.data.cameras import Cameras
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.checks import prepare
 from torch_surfcap.data.files import atomic_write
@@ -103,31 +102,40 @@ def run_trial(
 
 def photographed_once(scene: Scene, cache: Path) -> Capture:
     """The scene's capture, from the folder where it has been made before."""
-    path = cache / f"{_digest([asdict(scene), program_digest()])}.pt"
+    path = cache / f"{_digest([asdict(scene), program_digest()])}.npz"
     if not path.is_file():
-        capture = photographed(scene)
-        splits = {"train": capture, "test": capture.test}
-        with atomic_write(path) as partial:
-            torch.save({name: _packed(part) for name, part in splits.items() if part is not None}, partial)
-    parts = {name: _unpacked(part) for name, part in torch.load(path, weights_only=True).items()}
+        _save(photographed(scene), path)
+    return _load(path)
+
+
+def _save(capture: Capture, path: Path) -> None:
+    """Cameras and 8-bit pictures of either split, each picture an array of its own: their sizes may differ."""
+    arrays = dict[str, Any]()
+    for split, part in {"train": capture, "test": capture.test}.items():
+        if part is not None:
+            arrays[f"{split}.K"] = part.cameras.K.numpy()
+            arrays[f"{split}.world_to_camera"] = part.cameras.world_to_camera.numpy()
+            masks = [report.as_bytes(mask) for mask in part.masks or ()]
+            for kind, pictures in (("images", part.images), ("masks", masks), ("plates", part.plates)):
+                arrays |= {f"{split}.{kind}.{i:04}": np.asarray(p) for i, p in enumerate(pictures or ())}
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _load(path: Path) -> Capture:
+    """The capture that ``_save`` left there."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    parts = {}
+    for split in dict.fromkeys(name.partition(".")[0] for name in arrays):
+        images, masks, plates = (
+            [arrays[name] for name in sorted(arrays) if name.startswith(f"{split}.{kind}.")]
+            for kind in ("images", "masks", "plates")
+        )
+        cameras = arrays[f"{split}.K"], arrays[f"{split}.world_to_camera"]
+        parts[split] = Capture(images, *cameras, masks or None, plates or None)
     parts["train"].test = parts.get("test")
     return parts["train"]
-
-
-def _packed(capture: Capture) -> dict[str, Any]:
-    cameras = capture.cameras
-    masks = [report.as_bytes(mask) for mask in capture.masks or ()]
-    return {
-        "images": capture.images,
-        "masks": [torch.from_numpy(np.ascontiguousarray(mask)) for mask in masks],
-        "plates": capture.plates,
-        "cameras": (cameras.K, cameras.world_to_camera, cameras.size),
-    }
-
-
-def _unpacked(part: dict[str, Any]) -> Capture:
-    cameras = Cameras(*part["cameras"])
-    return Capture(part["images"], cameras.K, cameras.world_to_camera, part["masks"], part["plates"])
 
 
 def _reference(scene: Scene, cache: Path) -> tuple[trimesh.Trimesh, dict[str, np.ndarray]]:
