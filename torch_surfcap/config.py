@@ -95,7 +95,7 @@ class DescentConfig:
     stop: float | None = _within(None, 0, 1)  # transmittance below which a ray ends
     fall: float | None = _within(
         None, 0, 1
-    )  # of the loss in 5 iterations, as its share, that keeps the rates
+    )  # share of the loss that 5 iterations take off, else the rates fall
     drops: int | None = _within(None, 1)  # of the rates; the last one ends a level
 
 

@@ -77,8 +77,5 @@ def conditions() -> list[Condition]:
         ),
         Condition(GROUP, "threads", "1", "One thread.", "same", threads=1),
         Condition(GROUP, "repeated", "", "The clean run once more.", "same"),
-        *(
-            Condition(GROUP, "seed", f"{seed}", "Another seed.", settings={"seed": seed})
-            for seed in (1, 2)
-        ),
+        *(Condition(GROUP, "seed", f"{seed}", "Another seed.", settings={"seed": seed}) for seed in (1, 2)),
     ]
