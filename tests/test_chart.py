@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from matplotlib.text import Text
 
 from tests.fitting.stages import begun
 from torch_surfcap import ops
@@ -25,6 +28,7 @@ from torch_surfcap.studies import chart, chart_figures, chart_page
 from torch_surfcap.studies import rows as processes
 from torch_surfcap.studies.ablation import Row, read_table
 from torch_surfcap.studies.chart import BEGIN, END, PRESETS, RIVALS, Mark, Published
+from torch_surfcap.studies.chart_names import Spot, write_names
 from train import chart as command
 from train import rivals
 
@@ -41,7 +45,8 @@ SECONDS = {
 def made_up(
     name: str, seconds: float, chamfer: float, group: str = PRESETS, title: str = PRESETS, **more: float
 ) -> Mark:
-    scores = {"seconds": seconds, "chamfer": chamfer, "psnr_masked": 30 - 1000 * chamfer, "memory": 2.0**30}
+    scores = {"seconds": seconds, "chamfer": chamfer, "psnr_volume": 35 - 1000 * chamfer, "memory": 2.0**30}
+    scores["psnr_masked"] = scores["psnr_volume"] - 5
     return Mark("ball", group, title, name, "x=1", scores | more, chart.breakdown(SECONDS))
 
 
@@ -137,10 +142,31 @@ def test_pictures(tmp_path: Path) -> None:
     )
     assert all(file.stat().st_size > 2000 for file in files)
     drawn = (tmp_path / "accuracy.svg").read_text(encoding="utf-8")
-    for words in ("standard", "published, other hardware", "Pareto front", "rivals", "ProbeSDF"):
+    for words in ("standard", "published, other hardware", "Pareto front", "rivals", "ProbeSDF", "1 GiB"):
         assert words in drawn
     assert "power +2.00" in (tmp_path / "growth.svg").read_text(encoding="utf-8")
     assert "voxel" not in (tmp_path / "work.svg").read_text(encoding="utf-8")  # takes no time here
+
+
+def test_names_find_room() -> None:
+    """In a crowd all that are needed are written, the others only where they cover nothing; those far away have a line."""
+    random = np.random.default_rng(0)
+    figure, panels = chart_figures._figure(1, 1)
+    axes = panels[0, 0]
+    axes.plot([0, 1], [0.5, 0.5])
+    crowd = [(*random.uniform(0.2, 0.8, 2), i < 6) for i in range(40)]
+    spots = [Spot(x, y, 30.0, f"number {i}", "k", 8.0, needed) for i, (x, y, needed) in enumerate(crowd)]
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    write_names(axes, spots)
+    names = [text.get_text() for text in axes.texts]
+    assert names[:6] == [spot.text for spot in spots[:6]]
+    assert 6 < len(names) < 40
+    boxes = [Text.get_window_extent(text, figure.canvas.get_renderer()) for text in axes.texts]
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+    marks = axes.transData.transform([(spot.x, spot.y) for spot in spots])
+    assert not any(box.contains(*at) for box in boxes for at in marks)
+    assert {text.arrow_patch.get_visible() for text in axes.texts} == {True, False}
 
 
 def test_presets_and_sweep_are_sound(tmp_path: Path) -> None:

@@ -49,7 +49,12 @@ AXES = {
     "views": "cameras",
     "per_voxel": "1/voxel, per unit of length",
 }
-COSTS = {"seconds": "s", "fit_seconds": "s of the fit", "memory": "bytes", "chamfer": "Chamfer"}
+COSTS = {
+    "seconds": "seconds",
+    "fit_seconds": "seconds of the fit",
+    "memory": "peak memory, GiB",
+    "chamfer": "Chamfer",
+}
 
 
 class Mark(NamedTuple):

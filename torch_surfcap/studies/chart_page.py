@@ -54,8 +54,8 @@ Chamfer is of the mesh against the true surface, PSNR of views of full size that
 
 ![Accuracy against seconds]({folder}/accuracy.png)
 
-*Chamfer and held-out PSNR against seconds; the area of a mark is the peak memory. Published figures are of other hardware
-and other data: they place the method, they are no race.*
+*Chamfer, and PSNR of whole held-out pictures as it is published, against seconds; the area of a mark is the peak memory.
+Published figures are of other hardware and other data: they place the method, they are no race.*
 
 ## Tables
 
