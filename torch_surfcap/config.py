@@ -93,9 +93,7 @@ class DescentConfig:
     visit: str | None = _one_of(None, *VISITS)  # of a ray: its ranges, the cells not empty, or the box
     bundle: int | None = _within(None, 1)  # consecutive rays that share a list of integration ranges
     stop: float | None = _within(None, 0, 1)  # transmittance below which a ray ends
-    fall: float | None = _within(
-        None, 0, 1
-    )  # share of the loss that 5 iterations take off, else the rates fall
+    fall: float | None = _within(None, 0, 1)  # share of the loss that 5 iterations must take off it
     drops: int | None = _within(None, 1)  # of the rates; the last one ends a level
 
 
@@ -104,9 +102,7 @@ class CamerasConfig:
     skip: list[str] = field(default_factory=list)  # names or numbers of cameras to leave out
     take: int = _within(0, 0)  # so many training cameras, evenly spread; 0: all
     reject: str = _one_of("auto", *CHOICES["reject"])  # auto: leave out those that contradict the others
-    refine: str = _one_of(
-        "auto", *CHOICES["refine"]
-    )  # auto: correct a calibration that the photographs contradict
+    refine: str = _one_of("auto", *CHOICES["refine"])  # auto: correct a calibration that is off
 
 
 @dataclass

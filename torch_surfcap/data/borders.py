@@ -23,7 +23,10 @@ NEAR = 2  # pixels over which an outline is spread
 
 def border_offset(photographs: Sequence[Picture], masks: Sequence[Plane]) -> int:
     """By how many pixels the subject reaches beyond its masks, or, negative, ends within them; 0 where nothing is clear."""
-    views = evenly(list(zip(photographs, masks, strict=True)), min(VIEWS, len(masks)))
+    views = [view for view in zip(photographs, masks, strict=True) if _has_border(*view)]
+    if not views:
+        return 0
+    views = evenly(views, min(VIEWS, len(views)))
     sums = np.sum(in_threads(lambda view: _changes(*view), views), axis=0)
     change = sums[0] / np.maximum(sums[1], 1)
     peak = int(change.argmax())
@@ -33,6 +36,12 @@ def border_offset(photographs: Sequence[Picture], masks: Sequence[Plane]) -> int
         return 0
     weight = np.maximum(change[near], 0)
     return round(float(weight @ np.arange(-REACH, REACH + 1)[near] / weight.sum()))
+
+
+def _has_border(photograph: Picture, mask: Plane) -> bool:
+    """Whether there are a subject and a background, in numbers."""
+    finite = np.isfinite(photograph.min()) and np.isfinite(photograph.max()) and np.isfinite(mask.sum())
+    return bool(finite and mask.max() >= 0.5 > mask.min())
 
 
 def _changes(photograph: Picture, mask: Plane) -> NDArray[np.float64]:

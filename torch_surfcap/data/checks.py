@@ -104,6 +104,7 @@ def _correct_masks(capture: Capture, photographs: list[Picture]) -> int:
         if pixels:
             capture.masks = [torch.from_numpy(mask) for mask in fitted]
             capture.warnings.append(f"{_wrong_by(pixels)}, corrected")
+        if pixels is not None:
             return pixels
     if capture.mask_source != "file":  # alpha goes with its colours, which end nowhere
         return 0

@@ -65,20 +65,23 @@ def _soft_edge(binary: Binary, contrast: Plane) -> Plane:
     return np.where(border, fraction, binary).astype(np.float32)
 
 
-def fit_to_background(photographs: Sequence[Picture], masks: Sequence[Plane]) -> tuple[list[Plane], int]:
-    """Masks that end where the background does, and by how many pixels at most they were widened (cut where negative).
+def fit_to_background(
+    photographs: Sequence[Picture], masks: Sequence[Plane]
+) -> tuple[list[Plane], int | None]:
+    """Masks that end where the background does, and by how many pixels at most they were widened (cut where negative);
+    None where that cannot be told.
 
-    Only where the background beyond the masks is of one colour in all pictures. As long as most of the masks' outermost
-    pixels show that colour, those that do are taken away; as long as nearly all pixels beside the masks do not, these
-    are added. Masks that follow the subject stay as they are, also where it is here and there of that colour itself.
+    Only where the background beyond the masks is of one colour in all pictures it can. As long as most of the masks'
+    outermost pixels show that colour, those that do are taken away; as long as nearly all pixels beside the masks do not,
+    these are added. Masks that follow the subject stay as they are, also where it is here and there of that colour itself.
     """
     beyond = [p[m == 0][::17] for p, m in zip(photographs, masks, strict=True)]
     colors = as_float(np.concatenate(beyond))
     if len(colors) == 0:
-        return list(masks), 0
+        return list(masks), None
     background = np.median(colors, axis=0)
     if (np.abs(colors - background).max(axis=1) < ONE_COLOR).mean() < UNIFORM:
-        return list(masks), 0
+        return list(masks), None
     contrast = [np.abs(as_float(p) - background).max(axis=2) for p in photographs]
     empty = [c < ONE_COLOR for c in contrast]
     for sign in (-1, 1):

@@ -37,18 +37,20 @@ OFF = 0.1  # median shift, pixels of the level, above which a calibration is off
 @dataclass(frozen=True)
 class Pinholes:
     """Cameras as they were calibrated, on the rays' device. K, its inverse, rotation (world to camera): [N, 3, 3]
-    float64; widths: of the pictures."""
+    float64; centers: [N, 3] float32; widths: of the pictures."""
 
     K: Tensor
     inverse: Tensor
     rotation: Tensor
+    centers: Tensor
     widths: list[int]
 
     @staticmethod
     def of(cameras: Cameras, device: torch.device) -> Pinholes:
         rotation = cameras.world_to_camera[:, :3, :3]
-        K, inverse, turn = (part.to(device) for part in (cameras.K, torch.linalg.inv(cameras.K), rotation))
-        return Pinholes(K, inverse, turn, cameras.size[:, 0].tolist())
+        parts = (cameras.K, torch.linalg.inv(cameras.K), rotation, cameras.centers.float())
+        K, inverse, turn, centers = (part.to(device) for part in parts)
+        return Pinholes(K, inverse, turn, centers, cameras.size[:, 0].tolist())
 
     def through(self, i: int, pixels: Tensor) -> Tensor:
         """[M, 3] float64: K^-1 times the centres of camera i's pixels, given by their row-major numbers [M]."""
@@ -63,6 +65,7 @@ class Pinholes:
             part = rays.of_camera(i)
             x, y, z = self.through(i, rays.pixels[part]).unbind(1)
             point = torch.stack([x + tx + zoom * x - roll * y, y + ty + zoom * y + roll * x, z], 1)
+            rays.origins[part] = self.centers[i]
             rays.directions[part] = torch.nn.functional.normalize(point @ self.rotation[i], dim=1).float()
 
     def projections(self, motion: Tensor) -> Tensor:

@@ -85,8 +85,9 @@ class Saved:
             name: torch.from_numpy(a).to(device) for name, a in self.arrays.items() if name != "generator"
         }
         studio.exposure = Exposure(arrays["gain"], arrays["bias"])
-        studio.motion, studio.refines = arrays["motion"], plain["refines"]
-        studio.look_again()
+        studio.motion, studio.refines = arrays["looked"], plain["refines"]
+        studio.look_again()  # the level's rays were gathered so
+        studio.motion = arrays["motion"]
         if torch.device(plain["settings"]["device"]).type == device.type:
             studio.generator.set_state(torch.from_numpy(self.arrays["generator"]))
         else:
@@ -194,6 +195,7 @@ class Checkpoints:
             "gain": studio.exposure.gain,
             "bias": studio.exposure.bias,
             "motion": studio.motion,
+            "looked": studio.looked,
         }
         fields = [("", stage.grid, stage.adam)]
         if stage.view:

@@ -37,7 +37,8 @@ class Studio:
     pictures: the capture, halved 0, 1, ... times. backdrop: see ``RayBatch.expose``. generator: of the lattices' shifts.
     gains: whether the exposure is fitted; per_channel: or one gain and bias for all channels of a camera. floor: below
     which nothing is, where one was found. given: the cameras of the pictures, as calibrated. motion: [N, 4] by which their
-    pictures have moved since (see ``torch_surfcap.fitting.alignment``); refines: whether they go on to.
+    pictures have moved since (see ``torch_surfcap.fitting.alignment``); looked: by how much when the level began; refines:
+    whether they go on to.
     """
 
     pictures: list[Capture]
@@ -50,6 +51,7 @@ class Studio:
     origin: Tensor
     given: list[Cameras]
     motion: Tensor
+    looked: Tensor
     refines: bool
 
     def keep_pictures(self, images: str, level_bytes: list[int]) -> None:
@@ -88,6 +90,7 @@ class Studio:
 
     def look_again(self) -> None:
         """Rays of the levels to come are those of the cameras as they now look."""
+        self.looked = self.motion
         for capture, given in zip(self.pictures, self.given, strict=True):
             capture.cameras = moved(given, self.motion)
 
@@ -243,7 +246,18 @@ def open_studio(
     motion = torch.zeros(len(capture), 4, dtype=torch.float64, device=settings.device)
     refines = may_refine(settings, halvings)
     return Studio(
-        pictures, backdrop, equal, gains, per_channel, generator, floor, origin, given, motion, refines
+        pictures,
+        backdrop,
+        equal,
+        gains,
+        per_channel,
+        generator,
+        floor,
+        origin,
+        given,
+        motion,
+        motion,
+        refines,
     )
 
 
