@@ -22,7 +22,7 @@ from torch_surfcap import config as settings
 from torch_surfcap import devices
 from torch_surfcap.data.sample_scene import make_sample_scene
 from torch_surfcap.field.field import SurfaceField
-from torch_surfcap.fitting.fit import Progress
+from torch_surfcap.fitting.course import Progress
 from train import fit
 
 SIZE, VIEWS, TEST_VIEWS = 64, 12, 2

@@ -22,7 +22,7 @@ from tests.fitting.sphere import ball
 from torch_surfcap import InputError, fit
 from torch_surfcap.data.sample_scene import make_sample_scene
 from torch_surfcap.fitting.checkpoint import Checkpoints
-from torch_surfcap.fitting.fit import Progress
+from torch_surfcap.fitting.course import Progress
 from train import fit as command
 
 KILLS = int(os.environ.get("SURFCAP_KILLS", "3"))

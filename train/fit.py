@@ -38,7 +38,8 @@ from torch_surfcap.data.capture import Capture, load_capture
 from torch_surfcap.errors import InputError
 from torch_surfcap.fitting.alignment import aligned
 from torch_surfcap.fitting.checkpoint import FREE, Checkpoints
-from torch_surfcap.fitting.fit import FitResult, Progress, fit
+from torch_surfcap.fitting.course import Progress
+from torch_surfcap.fitting.fit import FitResult, fit
 
 RESULTS = ("mesh.ply", "mesh.glb", "field.npz", "config.yaml", "preview.png", "history.csv", "metrics.json")
 EVALUATED = (

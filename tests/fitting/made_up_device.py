@@ -25,7 +25,7 @@ from tests.fitting.sphere import ball
 from torch_surfcap import SurfaceField, devices, fit
 from torch_surfcap.fitting import late
 from torch_surfcap.fitting.checkpoint import Checkpoints
-from torch_surfcap.fitting.fit import Progress
+from torch_surfcap.fitting.course import Progress
 from torch_surfcap.surface.render import volume
 
 DEVICE = "made_up"

@@ -15,7 +15,7 @@ from tests.fitting.sphere import CENTER, RADIUS, ball
 from tests.fitting.stages import begun
 from torch_surfcap import Capture, FitResult, InputError, devices, fit
 from torch_surfcap.field.field import RayOutput
-from torch_surfcap.fitting import fit as fit_function
+from torch_surfcap.fitting import course
 from torch_surfcap.fitting.budget import estimate, shortage
 from torch_surfcap.fitting.levels import first_field, plan_levels, subject_box
 from torch_surfcap.fitting.settings import FitSettings
@@ -186,7 +186,7 @@ def test_a_level_without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
             asked.append(needed)
             return "needs too much" if len(asked) > number else None
 
-        monkeypatch.setattr(fit_function, "shortage", answer)
+        monkeypatch.setattr(course, "shortage", answer)
 
     short_from(0)
     with pytest.raises(InputError, match=r"memory: level 1 of 2 .* needs too much"):
@@ -205,7 +205,7 @@ def test_memory_that_runs_out(at: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a device, in the midst of a level: as if it had been known before."""
     capture, whole = ball(6, 32), fit(ball(6, 32), sh_degree=0, levels=1, voxel=0.1)
     monkeypatch.setattr(devices, "may_run_out", lambda _: True)
-    there = getattr(fit_function, at)
+    there = getattr(course, at)
 
     def no_memory_at(number: int) -> None:
         calls: list[int] = []
@@ -223,7 +223,7 @@ def test_memory_that_runs_out(at: str, monkeypatch: pytest.MonkeyPatch) -> None:
                 raise torch.OutOfMemoryError("CUDA out of memory")
             return there(*arguments)
 
-        monkeypatch.setattr(fit_function, at, runs_out)
+        monkeypatch.setattr(course, at, runs_out)
 
     if at != "next_stage":
         no_memory_at(0)
