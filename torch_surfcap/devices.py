@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator
 
 import psutil
 import torch
@@ -51,18 +50,6 @@ def resolve(word: str) -> torch.device:
 def current(device: torch.device) -> contextlib.AbstractContextManager[object]:
     """Within it, streams and events are those of this device."""
     return torch.cuda.device(device) if device.type == "cuda" else contextlib.nullcontext()
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Within it, torch works on the CPU in the calling thread alone: for loops over cameras, whose many small steps cost
-    less than waking the other threads for each of them, and far less where these have to wait for a processor."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(count)
 
 
 def free_bytes(device: torch.device) -> int:

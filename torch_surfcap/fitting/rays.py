@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_surfcap import codes, devices, ops
+from torch_surfcap import codes, ops
 from torch_surfcap.autograd import March
 from torch_surfcap.data.arrays import float_tensor
 from torch_surfcap.data.cameras import Cameras
@@ -71,7 +71,6 @@ class RayBatch:
         found = RangeFinder(store, grid, opacity, march).ranges(self.origins, self.directions)
         self.ranges = shared_ranges(found, self.bundle)
 
-    @devices.one_thread()
     def expose(self, capture: Capture, backdrop: Tensor | None, exposure: Exposure) -> None:
         """Sets target and background in the common exposure.
 
@@ -91,7 +90,6 @@ class RayBatch:
                 self.background[part] = backdrop
                 self.target[part] = soft * photograph + (1 - soft) * backdrop
 
-    @devices.one_thread()
     def equations(
         self, capture: Capture, backdrop: Tensor | None, color: Tensor, transmittance: Tensor
     ) -> Equations:
