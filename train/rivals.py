@@ -202,8 +202,11 @@ def _parts(ranges: tuple[Tensor, Tensor], step: float) -> Iterator[slice]:
 
 @contextmanager
 def plain_torch(until: float = math.inf) -> Iterator[None]:
-    """Steps of a fit are taken in torch operators; none begins later than ``until``, by ``time.time()``."""
-    over = property(lambda rule: time.time() >= until or rule.drops <= 0 or rule.count >= rule.limit)
+    """Steps of a fit are taken in torch operators; none but a level's first begins later than ``until``, by
+    ``time.time()``."""
+    over = property(
+        lambda rule: (time.time() >= until and rule.count > 0) or rule.drops <= 0 or rule.count >= rule.limit
+    )
     steps: dict[str, Any] = {
         "photometric_step": photometric_step,
         "voxel_terms": reference.voxel_terms,
@@ -214,7 +217,7 @@ def plain_torch(until: float = math.inf) -> Iterator[None]:
 
 
 def autograd(until: float, *arguments: Any, **given: Any) -> FitResult:
-    """A fit of which no step begins later than ``until``."""
+    """A fit of which no step begins later than ``until``, but for each level's first."""
     with plain_torch(until):
         return fit(*arguments, **given)
 
@@ -260,7 +263,9 @@ def main(arguments: Sequence[str] | None = None, began: float | None = None) -> 
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--method", choices=("hull", "autograd"), required=True)
-    parser.add_argument("--seconds", type=float, default=math.inf, help="after which no step begins")
+    parser.add_argument(
+        "--seconds", type=float, default=math.inf, help="after which no step but a level's first begins"
+    )
     parser.add_argument("settings", nargs="*", metavar="key=value", help="as of train/fit.py")
     options = parser.parse_intermixed_args(arguments)
     try:
