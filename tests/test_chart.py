@@ -224,10 +224,12 @@ def test_step_of_the_rival(scene: Path, opacity: str, monkeypatch: pytest.Monkey
             torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-3, equal_nan=True)
 
 
-def test_no_step_begins_when_the_seconds_are_spent() -> None:
+def test_no_second_step_begins_when_the_seconds_are_spent() -> None:
     compiled = ops.photometric_step
     with rivals.plain_torch(time.time() - 1):
-        assert Plateau(limit=9).ended
+        rule = Plateau(limit=9)
+        assert not rule.ended
+        assert not rule.goes_on(1.0)
         swapped: Any = ops.photometric_step
         assert swapped is rivals.photometric_step
     assert not Plateau(limit=9).ended
