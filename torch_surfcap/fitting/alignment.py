@@ -31,7 +31,7 @@ ROBUST = 0.1  # difference of colours above which it counts linearly
 # What is known beforehand: shift (pixels of the level), zoom and roll are 0 to within these, a colour to within NOISE.
 DEVIATION, NOISE = (1.0, 1.0, 0.01, 0.01), 0.05
 FARTHEST = 0.05  # of a picture's size: a camera that seems shifted further is wrong altogether, and stays where it is
-OFF = 0.1  # median shift, pixels of the level, above which a calibration is off: below, the registration itself errs
+OFF = 0.2  # median shift, pixels of the level, from which on a calibration is off: less, wrong geometry may cause
 
 
 @dataclass(frozen=True)
