@@ -98,19 +98,14 @@ def _correct_masks(capture: Capture, photographs: list[Picture]) -> int:
     """By how many pixels the masks end within the subject (beyond it where negative); those before a background of one
     colour or, without plates, any other are corrected."""
     assert capture.masks is not None
-    masks = [mask.numpy() for mask in capture.masks]
+    masks, pixels = [mask.numpy() for mask in capture.masks], None
     if capture.plates is None:
         fitted, pixels = fit_to_background(photographs, masks)
-        if pixels:
-            capture.masks = [torch.from_numpy(mask) for mask in fitted]
-            capture.warnings.append(f"{_wrong_by(pixels)}, corrected")
-        if pixels is not None:
-            return pixels
-    if capture.mask_source != "file":  # alpha goes with its colours, which end nowhere
-        return 0
-    pixels = border_offset(photographs, masks)
+    if pixels is None:  # alpha goes with its colours, which end nowhere
+        pixels = border_offset(photographs, masks) if capture.mask_source == "file" else 0
+        fitted = [widened(mask, pixels) for mask in masks] if pixels else masks
     if pixels and capture.plates is None:
-        capture.masks = [torch.from_numpy(widened(mask, pixels)) for mask in masks]
+        capture.masks = [torch.from_numpy(mask) for mask in fitted]
         capture.warnings.append(f"{_wrong_by(pixels)}, corrected")
     return pixels
 

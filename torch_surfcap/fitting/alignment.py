@@ -61,24 +61,15 @@ class Pinholes:
 
     def aim(self, rays: RayBatch, motion: Tensor) -> None:
         """Turns the rays, in place, to where the cameras look once their pictures have moved by [N, 4]."""
-        for i, (tx, ty, zoom, roll) in enumerate(motion):
+        for i, matrix in enumerate(_matrices(motion)):
             part = rays.of_camera(i)
-            x, y, z = self.through(i, rays.pixels[part]).unbind(1)
-            point = torch.stack([x + tx + zoom * x - roll * y, y + ty + zoom * y + roll * x, z], 1)
+            point = self.through(i, rays.pixels[part]) @ matrix.T
             rays.origins[part] = self.centers[i]
             rays.directions[part] = torch.nn.functional.normalize(point @ self.rotation[i], dim=1).float()
 
     def projections(self, motion: Tensor) -> Tensor:
         """[N, 3, 3] what takes directions in the world to pixels once the pictures have moved by [N, 4]."""
-        (tx, ty, zoom, roll), zero = motion.unbind(1), torch.zeros_like(motion[:, 0])
-        a, b = 1 + zoom, roll
-        square = a * a + b * b
-        rows = (
-            (a / square, b / square, -(a * tx + b * ty) / square),
-            (-b / square, a / square, (b * tx - a * ty) / square),
-            (zero, zero, zero + 1),
-        )
-        back = torch.stack([torch.stack(row, 1) for row in rows], 1)
+        back, _ = torch.linalg.inv_ex(_matrices(motion))  # waits for no verdict
         return self.K @ back @ self.rotation
 
 
@@ -143,9 +134,7 @@ class Registration:
         cameras = (rows[begin:end].flatten(0, 1).double() for begin, end in ends)
         products = torch.stack([camera.T @ camera for camera in cameras])
         normal = products[:, :4, :4] + self.prior
-        step, _ = torch.linalg.solve_ex(
-            normal, products[:, :4, 4]
-        )  # which waits for no verdict, unlike `solve`
+        step, _ = torch.linalg.solve_ex(normal, products[:, :4, 4])  # waits for no verdict, unlike `solve`
         total = motion + step
         total = total * (total[:, :2].norm(dim=1) < self.farthest)[:, None]
         return total - (self.common @ (self.inverse @ total.flatten())).view_as(total)
@@ -159,17 +148,11 @@ def shifts(given: Cameras, motion: Tensor) -> Tensor:
 def moved(cameras: Cameras, motion: Tensor) -> Cameras:
     """The cameras whose pictures have moved by [N, 4], of whatever size they are: x + d(x) = k (cos, -sin; sin, cos) x + t
     is a longer focal length, another principal point and a turn about the line of sight."""
-    motion = motion.cpu().double()
-    shift, along, across = motion[:, :2], 1 + motion[:, 2], motion[:, 3]
-    k = torch.hypot(along, across)
-    turn = torch.eye(4, dtype=torch.float64).repeat(len(k), 1, 1)
-    turn[:, 0, 0] = turn[:, 1, 1] = along / k
-    turn[:, 1, 0], turn[:, 0, 1] = across / k, -across / k
-    back = turn.transpose(1, 2)
-    narrowed = torch.eye(3, dtype=torch.float64).repeat(len(k), 1, 1)
-    narrowed[:, [0, 1], [0, 1]] = (1 / k)[:, None]
-    narrowed[:, :2, 2] = -(back[:, :2, :2] @ shift[:, :, None])[:, :, 0] / k[:, None]
-    return Cameras(cameras.K @ narrowed, back @ cameras.world_to_camera, cameras.size)
+    matrices = _matrices(motion.cpu().double())
+    turn = torch.eye(4, dtype=torch.float64).repeat(len(matrices), 1, 1)
+    turn[:, :2, :2] = matrices[:, :2, :2] / torch.hypot(matrices[:, 0, 0], matrices[:, 1, 0])[:, None, None]
+    K = cameras.K @ torch.linalg.inv(matrices) @ turn[:, :3, :3]
+    return Cameras(K, turn.transpose(1, 2) @ cameras.world_to_camera, cameras.size)
 
 
 def aligned(capture: Capture, motions: Mapping[str, Sequence[float]]) -> Capture:
@@ -178,6 +161,14 @@ def aligned(capture: Capture, motions: Mapping[str, Sequence[float]]) -> Capture
     found = capture.subset(range(len(capture)))
     found.cameras = moved(capture.cameras, motion)
     return found
+
+
+def _matrices(motion: Tensor) -> Tensor:
+    """[N, 3, 3] x -> x + d(x) on pixels through K^-1, of motions [N, 4]."""
+    tx, ty, zoom, roll = motion.unbind(1)
+    one, zero = torch.ones_like(zoom), torch.zeros_like(zoom)
+    rows = ((one + zoom, -roll, tx), (roll, one + zoom, ty), (zero, zero, one))
+    return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
 def _inner(rays: RayBatch, cameras: Cameras, i: int) -> tuple[Tensor, Tensor]:

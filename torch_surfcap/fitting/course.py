@@ -125,10 +125,8 @@ class Course:
         self.studio.motion = torch.zeros_like(self.studio.motion)
         self.studio.refines = may_refine(s, self.plan[0].halvings)
         self.studio.look_again()
-        coarsest, names = self.plan[0], self.capture.names
-        left = [i for i, name in enumerate(names) if name not in so_far.left_out]
-        pictures = self.studio.pictures[coarsest.halvings].subset(left)
-        grid, store = self._first_field(pictures)
+        left = [i for i, name in enumerate(self.capture.names) if name not in so_far.left_out]
+        grid, store = self._first_field(self.studio.pictures[-1].subset(left))
         stage = begin_stage(s, self.plan, 0, grid, store, self.studio)
         self._save(stage)
         self._descend(stage)

@@ -146,9 +146,7 @@ def _without_contradicting(capture: Capture) -> tuple[Capture, dict[str, str]]:
     found = outliers.by_silhouettes(capture)
     if not found:
         return capture, {}
-    kept = leave_out(capture, found)
-    kept.prepared, kept.test = capture.prepared, capture.test
-    return kept, {capture.names[i]: why for i, why in found.items()}
+    return leave_out(capture, found), {capture.names[i]: why for i, why in found.items()}
 
 
 def _chosen(

@@ -69,7 +69,6 @@ class Studio:
         for n, capture in enumerate(self.pictures):
             assert capture.masks is not None
             without = capture.subset(range(len(capture)))
-            without.prepared = capture.prepared
             without.masks = [torch.zeros_like(m) if i in cameras else m for i, m in enumerate(capture.masks)]
             self.pictures[n] = without
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from torch_surfcap.data.capture import Capture
+from torch_surfcap.data.morphology import widened
 from torch_surfcap.studies.stress.condition import Array, Condition, copied, eight_bits
 
 GROUP = "silhouettes"
@@ -19,9 +20,7 @@ FRINGE = 2  # pixels of the room that stay around a subject that was cut out
 
 def grown(capture: Capture, pixels: int) -> Capture:
     """Masks grown by so many pixels to all sides, shrunk where negative."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(pixels) + 1,) * 2)
-    change = cv2.dilate if pixels > 0 else cv2.erode
-    return _masked(capture, lambda mask, i: change(mask, kernel))
+    return _masked(capture, lambda mask, i: widened(mask, pixels))
 
 
 def holed(capture: Capture, holes: int) -> Capture:
