@@ -29,6 +29,7 @@ from torch_surfcap.studies import rows as processes
 from torch_surfcap.studies.ablation import Row, read_table
 from torch_surfcap.studies.chart import BEGIN, END, PRESETS, RIVALS, Mark, Published
 from torch_surfcap.studies.chart_names import Spot, write_names
+from torch_surfcap.studies.marked_page import renewed
 from train import chart as command
 from train import rivals
 
@@ -111,9 +112,9 @@ def test_tables_and_csv() -> None:
 
 
 def test_page_is_renewed_between_its_markers() -> None:
-    page = chart.renewed("# Title\n\nWords.\n", "one")
+    page = renewed("# Title\n\nWords.\n", "one", (BEGIN, END))
     assert page.startswith("# Title\n\nWords.\n\n" + BEGIN)
-    again = chart.renewed(page + "After.\n", "two")
+    again = renewed(page + "After.\n", "two", (BEGIN, END))
     assert again == page.replace("one", "two") + "After.\n"
     assert again.count(BEGIN) == again.count(END) == 1
 

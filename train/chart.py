@@ -33,6 +33,7 @@ from torch_surfcap.studies import chart
 from torch_surfcap.studies.ablation import Group, Row, Scene, Table, plan, read_table
 from torch_surfcap.studies.chart import PRESETS, RIVALS, Mark
 from torch_surfcap.studies.chart_page import COLUMNS, content, score_tables
+from torch_surfcap.studies.marked_page import renewed
 from torch_surfcap.studies.rows import ROOT, read_result, run
 
 SWEEP = ROOT / "configs" / "chart" / "sweep.yaml"
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
             report.write_history(folder / "chart.csv", chart.csv_lines(marks))
             with atomic_write(options.page) as partial:
-                partial.write_text(chart.renewed(before, text), encoding="utf-8")
+                partial.write_text(renewed(before, text, (chart.BEGIN, chart.END)), encoding="utf-8")
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -31,13 +31,13 @@ from torch_surfcap import report
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.geometry import read_mesh
 from torch_surfcap.errors import InputError
+from torch_surfcap.studies.rows import ROOT, in_time
 from torch_surfcap.studies.stress import page
 from torch_surfcap.studies.stress.condition import Condition
 from torch_surfcap.studies.stress.scene import SUBJECTS, Scene
 from torch_surfcap.studies.stress.suite import CLEAN, GROUPS, all_conditions
 from torch_surfcap.studies.stress.trial import key_of, run_trial
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGE = Path("docs/stability.md")
 
 
@@ -65,12 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(conditions: Sequence[Condition], options: argparse.Namespace) -> bool:
     """Run what is not finished, as long as another run is likely to end in time; False when interrupted."""
     todo = [row for row in _rows(options, conditions) if not read_result(*row, options.out)]
-    start, longest = time.monotonic(), 0.0
-    for number, (scene, condition) in enumerate(todo):
-        begin = time.monotonic()
-        if begin - start + longest >= 60 * options.minutes:
-            print(f"out of time, {len(todo) - number} runs are left: the same command goes on with them")
-            break
+    for number, (scene, condition) in in_time(todo, 60 * options.minutes, "runs"):
         print(f"[{number + 1}/{len(todo)}] {scene}, {condition.title}: ", end="", flush=True)
         try:
             result = run_one(scene, condition, options)
@@ -78,7 +73,6 @@ def run(conditions: Sequence[Condition], options: argparse.Namespace) -> bool:
             print("interrupted")
             return False
         print(page.in_words(result), flush=True)
-        longest = max(longest, time.monotonic() - begin)
     return True
 
 

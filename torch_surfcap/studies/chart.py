@@ -251,16 +251,3 @@ def published_table(figures: Sequence[Published]) -> str:
             f"| {figure.source} |"
         )
     return "\n".join(text)
-
-
-def renewed(page: str, content: str) -> str:
-    """The page with ``content`` between its markers, or after its end where it has none.
-
-    >>> renewed(f"a\\n{BEGIN}\\nold\\n{END}\\nb\\n", "new") == f"a\\n{BEGIN}\\n\\nnew\\n\\n{END}\\nb\\n"
-    True
-    """
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        before, after = page.rstrip() + "\n\n" * bool(page.strip()), "\n"
-    return f"{before}{BEGIN}\n\n{content}\n\n{END}{after}"

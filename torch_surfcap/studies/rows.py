@@ -9,14 +9,15 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from torch_surfcap import report
 from torch_surfcap.studies.ablation import PACKAGE, Row, program_digest
 from torch_surfcap.studies.score_table import COLUMNS
 
+Item = TypeVar("Item")
 ROOT = PACKAGE.parent
 TRUTHS = {"--mesh-truth": "gt.ply", "--points-truth": "gt_visible.npz", "--concave": "concave.npz"}
 LARGE = ("field.npz", "mesh.glb", "error.ply")  # not kept of a row: hundreds of them fill a disk
@@ -30,12 +31,7 @@ def run(rows: Sequence[Row], scenes: Mapping[str, Path], out: Path, seconds: flo
         if row.key and "scores" not in read_result(row, out):
             unique.setdefault(folder_of(row, out), row)
     todo = list(unique.values())
-    start, longest = time.monotonic(), 0.0
-    for number, row in enumerate(todo):
-        begin = time.monotonic()
-        if begin - start + longest >= seconds:
-            print(f"out of time, {len(todo) - number} rows are left: the same command goes on with them")
-            break
+    for number, row in in_time(todo, seconds, "rows"):
         where = f"{row.scene}, opacity={row.opacity}, {row.name}"
         print(f"[{number + 1}/{len(todo)}] {where}: ", end="", flush=True)
         try:
@@ -48,8 +44,19 @@ def run(rows: Sequence[Row], scenes: Mapping[str, Path], out: Path, seconds: flo
             result.get("error")
             or ", ".join(f"{name} {scores[name]:.4g}" for name in COLUMNS if name in scores)
         )
-        longest = max(longest, time.monotonic() - begin)
     return True
+
+
+def in_time(todo: Sequence[Item], seconds: float, what: str) -> Iterator[tuple[int, Item]]:
+    """Numbers and items as long as another one is likely to end in time: none took longer; says how many are left."""
+    start, longest = time.monotonic(), 0.0
+    for number, item in enumerate(todo):
+        begin = time.monotonic()
+        if begin - start + longest >= seconds:
+            print(f"out of time, {len(todo) - number} {what} are left: the same command goes on with them")
+            return
+        yield number, item
+        longest = max(longest, time.monotonic() - begin)
 
 
 def run_row(row: Row, capture: Path, out: Path) -> dict[str, Any]:

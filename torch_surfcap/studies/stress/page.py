@@ -13,6 +13,7 @@ import torch
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
 from torch_surfcap.studies.ablation import program_digest
+from torch_surfcap.studies.marked_page import renewed
 from torch_surfcap.studies.stress.condition import Condition
 from torch_surfcap.studies.stress.suite import CLEAN
 
@@ -195,8 +196,6 @@ def write(path: Path, results: Results, command: str) -> None:
         raise InputError(f"{path}: expected the marks {MARKS[0]} and {MARKS[1]}, once each")
     picture = path.with_suffix(".png")
     write_heat_map(picture, results)
-    before, _, rest = text.partition(MARKS[0])
-    _, _, after = rest.partition(MARKS[1])
     done = sum(bool(result) for result in results.values())
     wrong = sum(as_expected(condition, result) is False for (_, condition), result in results.items())
     count = f"{done} of {len(results)} runs are done; in {wrong} the program did not do what is expected."
@@ -207,6 +206,6 @@ def write(path: Path, results: Results, command: str) -> None:
     )
     parts = [f"Written by\n\n    {command}\n\n{count} {what}", f"![heat map]({picture.name})"]
     parts += ["## Bounds", bounds_table(results), "## Every run", table(results), "## Conditions", sentences]
-    page = f"{before}{MARKS[0]}\n\n" + "\n\n".join(parts) + f"\n\n{MARKS[1]}{after}"
+    page = renewed(text, "\n\n".join(parts), MARKS)
     with atomic_write(path) as partial:
         partial.write_text(page, encoding="utf-8")
