@@ -220,6 +220,9 @@ def test_order_and_rounding(tiny: Capture) -> None:
 def test_scenes_hold_what_they_describe() -> None:
     plain = true_surface(TINY)
     assert true_surface(replace(TINY, wires=1.0)).bounds[1, 2] > plain.bounds[1, 2] + 0.2
+    hand = true_surface(replace(TINY, fingers=2.0))
+    tips = hand.vertices[hand.vertices[:, 2] > plain.bounds[1, 2] + 0.1]
+    assert len(np.unique(np.round(tips[:, 0] / (4 * TINY.voxel)))) == 5
     fringed = true_surface(replace(TINY, fringe=True))
     assert len(fringed.faces) > len(plain.faces) + 300 * 8
     assert true_surface(replace(TINY, second=True)).bounds[1, 0] == pytest.approx(0.85, abs=0.01)

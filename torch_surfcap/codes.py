@@ -13,8 +13,13 @@ from torch import Tensor
 
 from torch_surfcap import ops
 
-TYPES = {32: torch.float32, 16: torch.uint16, 8: torch.uint8}  # of the values, by bits
+TYPES = {64: torch.float64, 32: torch.float32, 16: torch.uint16, 8: torch.uint8}  # of the values, by bits
 MOMENTS = {torch.uint16: torch.float16, torch.uint8: torch.uint8}  # of Adam, beside codes
+
+
+def real(dtype: torch.dtype) -> torch.dtype:
+    """What is computed with beside values of this type: themselves, or float32 beside codes."""
+    return dtype if dtype.is_floating_point else torch.float32
 
 
 def steps(dtype: torch.dtype) -> int:
@@ -35,13 +40,13 @@ def bounds(
 
 
 def encode(voxels: Tensor, outside: float, inside: float, bits: int) -> Tensor:
-    """Padded records [..., P] float32 as codes of so many bits, rounded to the nearest; with 32, as they are.
+    """Padded records [..., P] float32 as codes of so many bits, rounded to the nearest; with 32 or 64, floats.
 
     >>> encode(torch.tensor([-4.0, 0.5, 2.0, 0.0]), 4.0, -4.0, 8).tolist()
     [0, 127, 254, 0]
     """
-    if bits == 32:
-        return voxels
+    if TYPES[bits].is_floating_point:
+        return voxels.to(TYPES[bits])
     low, high = bounds(voxels.shape[-1], outside, inside, device=voxels.device)
     top = steps(TYPES[bits])
     per_unit = torch.where(high != low, top / (high - low), 0.0)

@@ -132,7 +132,7 @@ class Config:
     upscale: str | None = _one_of(None, *CHOICES["upscale"])  # of a transparency to the next level
     gradient: str = _one_of("scatter", "scatter", "gather")  # exact, or read by the voxels (paper, eq. 19)
     lattice: int = _one_of(32, 32, 8)  # bits of a number of the samples' gradients that "gather" keeps
-    storage: int = _one_of(32, 32, 16, 8)  # bits of a coefficient during the fit, and of each of its moments
+    storage: int = _one_of(32, 64, 32, 16, 8)  # bits of a coefficient in the fit, and of each of its moments
     rounding: str = _one_of("stochastic", "stochastic", "nearest")  # of coefficients of 16 or 8 bits
     accumulator: int = _one_of(32, 32, 16)  # bits of the gradients' sums; 16 needs storage=16 or 8
     losses: LossesConfig = field(default_factory=LossesConfig)

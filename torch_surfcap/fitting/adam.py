@@ -25,7 +25,8 @@ class TileAdam:
         self.first, self.second = (torch.zeros_like(store, dtype=kept) for _ in range(2))
         self.t = 0
         count = ops.coefficients(ops.degree_of(store.shape[-1]))
-        self.low, self.high = codes.bounds(store.shape[-1], *MISSING[opacity], device=store.device)
+        bounds = codes.bounds(store.shape[-1], *MISSING[opacity], device=store.device)
+        self.low, self.high = (bound.to(codes.real(store.dtype)) for bound in bounds)
         self.rate = torch.zeros_like(self.low)
         self.rate[0], self.rate[1:4], self.rate[4:count] = (
             descent.rate_opacity,

@@ -37,7 +37,7 @@ OFF = 0.2  # median shift, pixels of the level, from which on a calibration is o
 @dataclass(frozen=True)
 class Pinholes:
     """Cameras as they were calibrated, on the rays' device. K, its inverse, rotation (world to camera): [N, 3, 3]
-    float64; centers: [N, 3] float32; widths: of the pictures."""
+    float64; centers: [N, 3]; widths: of the pictures."""
 
     K: Tensor
     inverse: Tensor
@@ -48,7 +48,7 @@ class Pinholes:
     @staticmethod
     def of(cameras: Cameras, device: torch.device) -> Pinholes:
         rotation = cameras.world_to_camera[:, :3, :3]
-        parts = (cameras.K, torch.linalg.inv(cameras.K), rotation, cameras.centers.float())
+        parts = (cameras.K, torch.linalg.inv(cameras.K), rotation, cameras.centers)
         K, inverse, turn, centers = (part.to(device) for part in parts)
         return Pinholes(K, inverse, turn, centers, cameras.size[:, 0].tolist())
 
@@ -65,7 +65,7 @@ class Pinholes:
             part = rays.of_camera(i)
             point = self.through(i, rays.pixels[part]) @ matrix.T
             rays.origins[part] = self.centers[i]
-            rays.directions[part] = torch.nn.functional.normalize(point @ self.rotation[i], dim=1).float()
+            rays.directions[part] = torch.nn.functional.normalize(point @ self.rotation[i], dim=1)
 
     def projections(self, motion: Tensor) -> Tensor:
         """[N, 3, 3] what takes directions in the world to pixels once the pictures have moved by [N, 4]."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torch_surfcap import devices, ops
+from torch_surfcap import codes, devices, ops
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.devices import CPU
 from torch_surfcap.field.field import DIAGONAL
@@ -66,18 +66,18 @@ def estimate(
     return Budget(level_bytes, seconds if device == CPU else None)
 
 
-def gradient_groups(numbers: int, device: torch.device = CPU, codes: bool = False) -> int:
+def gradient_groups(numbers: int, device: torch.device = CPU, coded: bool = False) -> int:
     """How many partial gradients a field of so many numbers, or codes, gets: as many as fit a fixed memory, whatever the
     threads; one on a GPU, whose threads add atomically."""
     if device != CPU:
         return 1
-    return CODE_GROUPS if codes else max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
+    return CODE_GROUPS if coded else max(GROUPS[0], min(GROUPS[1], GROUP_BYTES // (4 * max(numbers, 1))))
 
 
 def partial_gradients(store: Tensor, accumulator: int) -> Tensor:
     """Memory for the partial gradients [groups, T, 4, 4, 4, P] of a field of floats or codes, in so many bits."""
     groups = gradient_groups(store.numel(), store.device, not store.is_floating_point())
-    dtype = {32: torch.float32, 16: torch.float16}[accumulator]
+    dtype = torch.float16 if accumulator == 16 else codes.real(store.dtype)
     return torch.empty(groups, *store.shape, dtype=dtype, device=store.device)
 
 
@@ -89,7 +89,8 @@ def bytes_per_number(numbers: int, settings: FitSettings, device: torch.device =
     groups = gradient_groups(numbers, device, settings.storage < 32)
     if settings.gradient == "gather":
         groups = 1  # beside the slots, which are counted by samples
-    return (3 * settings.storage + groups * settings.accumulator) / 8
+    sums = 64 if settings.storage == 64 else 0
+    return (3 * settings.storage + groups * max(settings.accumulator, sums)) / 8
 
 
 def shortage(needed: int, remedy: str = LESS, device: torch.device = CPU) -> str | None:

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_surfcap import codes
 from torch_surfcap.data.capture import Capture
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
@@ -101,7 +102,7 @@ class Saved:
         counts = arrays["range_counts"].long()
         offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         ranges = (offsets, arrays["ranges"]) if settings.descent.visit == "ranges" else None
-        rays = rays_of(capture, grid, list(pixels), ranges, settings.descent.bundle)
+        rays = rays_of(capture, grid, list(pixels), ranges, settings.descent.bundle, codes.real(store.dtype))
         rays.expose(capture, studio.backdrop, studio.exposure)
         studio.aim(rays, level)
         adam = self._continued(begin_adam(store, settings), arrays)

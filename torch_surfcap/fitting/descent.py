@@ -78,7 +78,7 @@ def descend(stage: Stage, studio: Studio, settings: FitSettings) -> Iterator[dic
             watch.lap("ranges")
         lattices = len(rays.cameras) if gathered else len(rays)
         shift = torch.rand(lattices, generator=studio.generator, device=store.device) - 0.5
-        shift = shift * settings.descent.jitter
+        shift = (shift * settings.descent.jitter).to(rays.mask.dtype)
         if view:
             offset = view.seen_by(rays)
             arguments |= {"target": rays.target - offset, "background": rays.background - offset}

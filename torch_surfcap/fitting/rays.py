@@ -26,7 +26,7 @@ MARGIN = 4  # voxels beyond the silhouette that rays are followed
 
 @dataclass
 class RayBatch:
-    """R rays and their observations, float32, in the order of cameras and pixel blocks.
+    """R rays and their observations, in the order of cameras and pixel blocks; of the type that the field is computed with.
 
     origins, directions, target, background: [R, 3]; mask, weight: [R]; ranges: as ``ops.integration_ranges`` gives them,
     or None, where rays search for the cells that are not empty;
@@ -153,20 +153,21 @@ def gather_rays(
     level.
     """
     assert capture.masks is not None
+    dtype = codes.real(store.dtype)
     if visit == "box":
         everywhere = [
             _blocked((mask.amax() > 0).expand_as(mask).nonzero()).to(store.device) for mask in capture.masks
         ]
         widths = capture.cameras.size[:, 0].tolist()
         pixels = [(i[:, 0] * w + i[:, 1]).int() for i, w in zip(everywhere, widths, strict=True)]
-        return rays_of(capture, grid, pixels, None)
+        return rays_of(capture, grid, pixels, None, dtype=dtype)
     per_voxel = pixels_per_voxel(capture, grid)
     finder = RangeFinder(store, grid, opacity, march)
     chosen, counts, ranges = [], [], []
     for i, mask in enumerate(capture.masks):
         reach = int(torch.ceil(MARGIN * per_voxel[i])) + 1
         index = _blocked((grown(mask, reach) > 0).nonzero()).to(store.device)
-        origins, directions = _rays(capture, i, index)
+        origins, directions = _rays(capture, i, index, dtype)
         offsets, stretches = finder.ranges(origins, directions)
         passes = offsets.diff()
         hit = passes > 0
@@ -179,7 +180,7 @@ def gather_rays(
     passing = torch.cat(counts)
     offsets = torch.cat([passing.new_zeros(1), passing.cumsum(0)])
     found = shared_ranges((offsets, torch.cat(ranges)), bundle) if visit == "ranges" else None
-    return rays_of(capture, grid, chosen, found, bundle)
+    return rays_of(capture, grid, chosen, found, bundle, dtype)
 
 
 def rays_of(
@@ -188,6 +189,7 @@ def rays_of(
     pixels: list[Tensor],
     ranges: tuple[Tensor, Tensor] | None,
     bundle: int = 1,
+    dtype: torch.dtype = torch.float32,
 ) -> RayBatch:
     """The rays through pixels, given per camera by their row-major numbers, on their device, still without colours."""
     assert capture.masks is not None
@@ -196,9 +198,9 @@ def rays_of(
     for i, (mask, chosen) in enumerate(zip(capture.masks, pixels, strict=True)):
         width = mask.shape[1]
         index = torch.stack([chosen.long() // width, chosen.long() % width], 1)
-        known = mask.to(chosen.device).flatten()[chosen.long()]
+        known = mask.to(chosen.device).flatten()[chosen.long()].to(dtype)
         weight = torch.full_like(known, 1.0 / (len(capture) * float(per_voxel[i]) ** 2))
-        parts.append((*_rays(capture, i, index), known, weight))
+        parts.append((*_rays(capture, i, index, dtype), known, weight))
         starts.append(starts[-1] + len(index))
     origins, directions, mask, weight = (torch.cat(c).contiguous() for c in zip(*parts, strict=True))
     target, background = torch.empty_like(origins), torch.empty_like(origins)
@@ -216,10 +218,10 @@ def pixels_per_voxel(capture: Capture, grid: TileGrid) -> Tensor:
     return grid.voxel_size * focal / distance
 
 
-def _rays(capture: Capture, i: int, index: Tensor) -> tuple[Tensor, Tensor]:
-    """Origins and directions [M, 3], float32, through the centres of pixels [M, 2] (row, column)."""
+def _rays(capture: Capture, i: int, index: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Origins and directions [M, 3] through the centres of pixels [M, 2] (row, column)."""
     origins, directions = capture.cameras.rays(i, index.flip(1).double() + 0.5)
-    return origins.float().contiguous(), directions.float().contiguous()
+    return origins.to(dtype).contiguous(), directions.to(dtype).contiguous()
 
 
 class RangeFinder:

@@ -122,9 +122,11 @@ class FitSettings:
     threshold: opacity value of the surface, by default the field's level. specks: pieces under this fraction of the
                largest one's area are removed
     smooth:    rounds of Taubin smoothing of the mesh, by default what suits the opacity
-    storage:   bits of a coefficient during the fit, 32, 16 or 8, and of each of its moments
+    storage:   bits of a coefficient during the fit, 64, 32, 16 or 8, and of each of its moments; with 64 all arithmetic of
+               the fit is in double precision, to tell what rounding does
     rounding:  of narrow coefficients, "stochastic" or "nearest"
-    accumulator: bits of the gradients' sums; 32, or 16 where storage is less than 32 and the gradient is scattered
+    accumulator: bits of the gradients' sums; 32 (64 with 64 bits of storage), or 16 where storage is less than 32 and the
+               gradient is scattered
     losses, descent: see there; `losses=dict(mask=0.1)` changes one entry
     """
 
@@ -192,13 +194,14 @@ class FitSettings:
             )
         settings = FitSettings(**given)
         visits = VISITS if settings.gradient == "scatter" else VISITS[:1]
+        narrow = (32, 16, 8)
         may_halve = settings.storage < 32 and settings.gradient == "scatter"
         for name, sound in (
             ("sh_degree", settings.sh_degree in (None, 0, 1, 2)),
             ("view_spacing", settings.view_spacing in VIEW_SPACINGS),
             ("voxel", settings.voxel is None or settings.voxel > 0),
             ("voxel_pixels", settings.voxel_pixels > 0),
-            ("storage", settings.storage in (32, 16, 8)),
+            ("storage", settings.storage in ((64, *narrow) if settings.gradient == "scatter" else narrow)),
             ("rounding", settings.rounding in ("stochastic", "nearest")),
             ("accumulator", settings.accumulator in ((32, 16) if may_halve else (32,))),
             ("levels", settings.levels is None or settings.levels >= 1),

@@ -169,10 +169,10 @@ class Outcome:
         return store
 
     def surface(self, opacity: str, studio: Studio) -> SurfaceField:
-        """As a module, where it is in the world."""
-        view = self.view and SurfaceField(self.view[1], self.view[0].moved(studio.origin), KIND)
+        """As a module in single precision, where it is in the world."""
+        view = self.view and SurfaceField(self.view[1].float(), self.view[0].moved(studio.origin), KIND)
         grid = self.grid.moved(studio.origin)
-        return SurfaceField(self.decoded(opacity, studio.floor), grid, opacity, self.step, view)
+        return SurfaceField(self.decoded(opacity, studio.floor).float(), grid, opacity, self.step, view)
 
 
 def rendered(stage: Stage, settings: FitSettings) -> Tensor:
@@ -210,7 +210,8 @@ def begin_stage(
 ) -> Stage:
     """A level before its first iteration: rays gathered, Adam at rest. view: of the level before."""
     level, descent = plan[number], settings.descent
-    floats, store = store, codes.encode(store, *MISSING[settings.opacity], settings.storage)
+    floats = store.to(codes.real(codes.TYPES[settings.storage]))
+    store = codes.encode(floats, *MISSING[settings.opacity], settings.storage)
     march = march_of(settings, level)
     capture = studio.pictures[level.halvings]
     rays = gather_rays(capture, store, grid, settings.opacity, march, descent.bundle, descent.visit)

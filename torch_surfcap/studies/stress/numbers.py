@@ -75,6 +75,14 @@ def conditions() -> list[Condition]:
         Condition(
             GROUP, "float32", "", "The calibration is rounded to single precision.", "same", capture=rounded
         ),
+        Condition(
+            GROUP,
+            "double",
+            "",
+            "All arithmetic of the fit is in double precision.",
+            "same",
+            settings={"storage": 64},
+        ),
         Condition(GROUP, "threads", "1", "One thread.", "same", threads=1),
         Condition(GROUP, "repeated", "", "The clean run once more.", "same"),
         *(Condition(GROUP, "seed", f"{seed}", "Another seed.", settings={"seed": seed}) for seed in (1, 2)),

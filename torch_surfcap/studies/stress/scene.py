@@ -30,7 +30,8 @@ BOWL = ((0.0, 0.0, 1.05), 0.46, 0.38)  # centre, outer and inner radius
 OPENING = (0.0, -0.75, 0.66)  # direction the bowl opens to: a third of the cameras look into it
 FOOT = 0.12  # radius
 SPACING = 0.01  # of the bowl's marching cubes
-WIRE_LENGTH, HAIR_LENGTH, HAIR_WIDTH = 0.35, 0.08, 0.003
+WIRE_LENGTH, FINGER_LENGTH, HAIR_LENGTH, HAIR_WIDTH = 0.35, 0.12, 0.08, 0.003
+FINGERS = 5
 HAIRS = 300
 SUNK = 0.03  # depth in the floor of a subject that touches it
 LIGHT = (0.5, 0.3, -0.8)  # direction of the light that throws the shadow
@@ -41,16 +42,18 @@ SHADE = 0.6  # brightness of what lies in it
 class Scene:
     """What is photographed, and from where.
 
-    subject: one of SUBJECTS. depth: of the bowl, metres. wires: their width in voxels, 0: none. fringe: hairs all over.
-    second: a ball beside it. sunk: it stands in the floor, flat below. shadow: it throws one, and the masks hold it.
-    moment: camera WRONG saw it turned by 40 degrees. rig: "ring"; "mixed": distances, focal lengths and sizes that differ
-    several times; "inside": one camera stands within the subject's box. size: of the square pictures, pixels.
+    subject: one of SUBJECTS. depth: of the bowl, metres. wires: their width in voxels, 0: none. fingers: the width of
+    parallel ones, and of the gaps between them, in voxels, 0: none. fringe: hairs all over. second: a ball beside it.
+    sunk: it stands in the floor, flat below. shadow: it throws one, and the masks hold it. moment: camera WRONG saw it
+    turned by 40 degrees. rig: "ring"; "mixed": distances, focal lengths and sizes that differ several times; "inside":
+    one camera stands within the subject's box. size: of the square pictures, pixels.
     """
 
     subject: str = "figure"
     coat: Coat = field(default_factory=Coat)
     depth: float = 0.2
     wires: float = 0.0
+    fingers: float = 0.0
     fringe: bool = False
     second: bool = False
     sunk: bool = False
@@ -79,8 +82,13 @@ def true_surface(scene: Scene) -> trimesh.Trimesh:
     mesh = _subject(scene.subject, scene.depth)
     parts = [mesh]
     rng = np.random.default_rng(scene.seed)
+    top = np.array([0.0, 0.0, mesh.vertices[:, 2].max() - 0.05])
+    if scene.fingers:
+        width = scene.fingers * scene.voxel
+        for i in range(FINGERS):
+            foot = top + np.array([2 * width * (i - (FINGERS - 1) / 2), 0.0, 0.0])
+            parts.append(_rod(foot, foot + np.array([0.0, 0.0, 0.05 + FINGER_LENGTH]), width))
     if scene.wires:
-        top = np.array([0.0, 0.0, mesh.vertices[:, 2].max() - 0.05])
         for angle in (0.3, 2.4, 4.5):
             tip = np.array([0.6 * np.cos(angle), 0.6 * np.sin(angle), 0.8])
             parts.append(_rod(top, top + WIRE_LENGTH * tip, scene.wires * scene.voxel))

@@ -60,6 +60,16 @@ def conditions() -> list[Condition]:
                 scene=lambda scene, width=width: replace(scene, wires=width),  # type: ignore[misc]
             )
         )
+    for width in (3.0, 2.0, 1.0):
+        found.append(
+            Condition(
+                GROUP,
+                "fingers",
+                f"{width:g} voxels",
+                f"Five parallel fingers of 12 cm stand on it, {width:g} voxels wide and as far apart.",
+                scene=lambda scene, width=width: replace(scene, fingers=width),  # type: ignore[misc]
+            )
+        )
     found += [
         Condition(
             GROUP,
