@@ -17,16 +17,14 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from itertools import groupby
 from pathlib import Path
-
-import torch
 
 from torch_surfcap import report
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
-from torch_surfcap.studies.ablation import Row, Scene, Table, plan, program_digest, read_table
+from torch_surfcap.studies.ablation import Row, Scene, Table, plan, read_table
+from torch_surfcap.studies.provenance import machine, program
 from torch_surfcap.studies.rows import Results, read_result, run
 from torch_surfcap.studies.score_table import COLUMNS, Line, markdown
 
@@ -123,7 +121,7 @@ whole picture by ray integral and by the mesh, and the IoU of silhouettes are of
 to written files, CPU seconds count all threads, peak memory is the process's. The best of a column is bold, differences to
 the baseline stand in parentheses; one run a row, so that what differs by no more than another seed does means nothing.
 
-torch_surfcap {version} (program {program}), torch {torch}, {isa}, {threads} threads.
+{program} on {machine}.
 
 """
 
@@ -148,11 +146,8 @@ def frame(results: Results, table: Table, options: argparse.Namespace) -> str:
         done=done,
         failed=failed,
         left=len(results) - done - failed,
-        version=version("torch_surfcap"),
-        program=program_digest(),
-        torch=torch.__version__.partition("+")[0],
-        isa=torch.backends.cpu.get_cpu_capability(),
-        threads=torch.get_num_threads(),
+        program=program(),
+        machine=machine(),
     )
 
 

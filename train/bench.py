@@ -28,6 +28,7 @@ from torch.nn.functional import grid_sample
 from torch_surfcap import ops
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.reference import dense, harmonics, huber_norm
+from torch_surfcap.studies.provenance import machine
 
 TILES = 12  # along an edge of the cube of stored tiles; the table has one more tile on each side
 EDGE = 4 * TILES  # voxels, each one unit of length
@@ -248,10 +249,10 @@ def print_peak(arguments: argparse.Namespace) -> None:
 PAGE = """# Benchmarks
 
 Written by `make bench` (`python train/bench.py --out docs/benchmarks.md`), which checks that both sides agree on losses
-and gradient before it times them. Torch {torch}, {isa}, float32; {rays} rays through a cube of {edge}³ voxels, about
-{samples} samples each, one full batch. "Step" is value and gradient of the photometric, sample and mask losses by every
-voxel; "torch" is the same with `grid_sample` on the dense volume and autograd, on the same samples and threads. The
-calls take turns; medians of {rounds} rounds.
+and gradient before it times them. On {machine};
+float32; {rays} rays through a cube of {edge}³ voxels, about {samples} samples each, one full batch. "Step" is value and
+gradient of the photometric, sample and mask losses by every voxel; "torch" is the same with `grid_sample` on the dense
+volume and autograd, on the same samples and threads. The calls take turns; medians of {rounds} rounds.
 
 ## Nanoseconds per sample
 
@@ -286,8 +287,7 @@ def main() -> None:
     memory = memory_rows(arguments)  # first: on Linux a child's peak begins at its parent's size
     speed = speed_rows(arguments.pixels, arguments.cameras, arguments.rounds)
     page = PAGE.format(
-        torch=torch.__version__.partition("+")[0],
-        isa=torch.backends.cpu.get_cpu_capability(),
+        machine=machine(),
         rays=arguments.cameras * arguments.pixels**2,
         edge=EDGE,
         samples=round((EDGE + 4) / STEP),

@@ -1,17 +1,9 @@
-"""The page of a chart: its tables, the machine, the program's state."""
+"""The page of a chart and its tables."""
 
 from __future__ import annotations
 
-import platform
-import subprocess
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
-from pathlib import Path
 
-import psutil
-import torch
-
-from torch_surfcap.studies.ablation import PACKAGE, program_digest
 from torch_surfcap.studies.chart import (
     LARGE,
     LEFT,
@@ -22,6 +14,7 @@ from torch_surfcap.studies.chart import (
     published_table,
     work_table,
 )
+from torch_surfcap.studies.provenance import machine, program
 from torch_surfcap.studies.score_table import Line, markdown
 
 COLUMNS = ["chamfer", "normal_error_deg", "concave", "pieces", "psnr_masked", "psnr_volume", "psnr_raster"]
@@ -47,10 +40,10 @@ PAGE = """Written by
 
     {command}
 
-with the program's state {commit} (program {program}, torch_surfcap {version}) on {machine}. {done} rows are done, {failed}
-failed, {left} are still to be run. Seconds go from start to written files, peak memory is the process's, one run a row;
-Chamfer is of the mesh against the true surface, PSNR of views of full size that no fit saw. Every number stands in
-[chart.csv]({csv}).
+with {program} on {machine}. {done} rows are
+done, {failed} failed, {left} are still to be run. Seconds go from start to written files, peak memory is the process's,
+one run a row; Chamfer is of the mesh against the true surface, PSNR of views of full size that no fit saw. Every number
+stands in [chart.csv]({csv}).
 
 ![Accuracy against seconds]({folder}/accuracy.png)
 
@@ -99,9 +92,7 @@ def content(
     done, left = sum(bool(m.scores) for m in marks), sum(m.note == LEFT for m in marks)
     return PAGE.format(
         command=command,
-        commit=commit(),
-        program=program_digest(),
-        version=version("torch_surfcap"),
+        program=program(),
         machine=machine(),
         done=done,
         failed=len(marks) - done - left,
@@ -115,29 +106,3 @@ def content(
         published=source,
         elsewhere=published_table(published),
     )
-
-
-def machine() -> str:
-    """What ran the rows: processor, threads, memory, torch."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    isa, memory = torch.backends.cpu.get_cpu_capability(), psutil.virtual_memory().total / 2**30
-    return (
-        f"{models[0] if models else platform.machine()}, {torch.get_num_threads()} threads, {isa}, {memory:.0f} GiB, "
-        f"{platform.system()}, torch {torch.__version__.partition('+')[0]}"
-    )
-
-
-def commit() -> str:
-    """The repository's commit, and whether files differ from it; "unknown" without git."""
-    said = []
-    for words in (["rev-parse", "--short", "HEAD"], ["status", "--porcelain", "--untracked-files=no"]):
-        try:
-            done = subprocess.run(
-                ["git", "-C", str(PACKAGE), *words], capture_output=True, text=True, check=True
-            )
-        except (OSError, subprocess.CalledProcessError):
-            return "unknown"
-        said.append(done.stdout.strip())
-    return said[0] + (", changed" if said[1] else "")

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from torch_surfcap.data.files import atomic_write
 from torch_surfcap.errors import InputError
-from torch_surfcap.studies.ablation import program_digest
 from torch_surfcap.studies.marked_page import renewed
+from torch_surfcap.studies.provenance import machine, program
 from torch_surfcap.studies.stress.condition import Condition
 from torch_surfcap.studies.stress.suite import CLEAN
 
@@ -199,12 +198,13 @@ def write(path: Path, results: Results, command: str) -> None:
     done = sum(bool(result) for result in results.values())
     wrong = sum(as_expected(condition, result) is False for (_, condition), result in results.items())
     count = f"{done} of {len(results)} runs are done; in {wrong} the program did not do what is expected."
-    what = f"torch_surfcap (program {program_digest()}), torch {torch.__version__.partition('+')[0]}, "
-    what += f"{torch.backends.cpu.get_cpu_capability()}, {torch.get_num_threads()} threads."
     sentences = "\n".join(
         f"- *{c.title}*: {c.sentence}" for c in dict.fromkeys(condition for _, condition in results)
     )
-    parts = [f"Written by\n\n    {command}\n\n{count} {what}", f"![heat map]({picture.name})"]
+    parts = [
+        f"Written by\n\n    {command}\n\nwith {program()} on {machine()}. {count}",
+        f"![heat map]({picture.name})",
+    ]
     parts += ["## Bounds", bounds_table(results), "## Every run", table(results), "## Conditions", sentences]
     page = renewed(text, "\n\n".join(parts), MARKS)
     with atomic_write(path) as partial:
