@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import trimesh
 
@@ -100,14 +101,24 @@ def test_the_command_goes_on_where_it_was(
     assert "expected some of subject" in capsys.readouterr().err
 
 
+def test_an_interrupted_run_leaves_nothing_behind(tmp_path: Path) -> None:
+    options, stopped = stress._options([f"--out={tmp_path}", "--scenes=figure"]), threading.Event()
+    threading.Timer(0.5, stopped.set).start()
+    with pytest.raises(KeyboardInterrupt):
+        stress.run_one("figure", suite.CLEAN, options, stopped)
+    assert list(tmp_path.glob("figure/*/run.json")) == []
+    assert not any("stress.py" in " ".join(child.cmdline()) for child in psutil.Process().children())
+
+
 def test_a_stopped_process_does_not_hang() -> None:
+    never = threading.Event()
     sleeper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1)"])
     sleeper.send_signal(signal.SIGSTOP)
     waker = threading.Timer(2.0, sleeper.send_signal, [signal.SIGCONT])
     waker.start()
-    assert stress._wait(sleeper, 1.8) == 0
+    assert stress._wait(sleeper, 1.8, never) == 0
     waker.join()
     endless = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    assert stress._wait(endless, 0.3) is None
+    assert stress._wait(endless, 0.3, never) is None
     endless.kill()
-    assert stress._wait(endless, 5.0) == -signal.SIGKILL
+    assert stress._wait(endless, 5.0, never) == -signal.SIGKILL

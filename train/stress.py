@@ -1,11 +1,13 @@
 """Stability: what a fit makes of inputs that are spoilt one way at a time.
 
-    python train/stress.py --out OUT [--scenes figure,bowl] [--groups NAME,...] [--only TEXT] [--minutes 60] [--page MD]
+    python train/stress.py --out OUT [--scenes figure,bowl] [--groups NAME,...] [--only TEXT] [--minutes 60] [--jobs 2]
+                           [--page MD]
 
 Every condition (torch_surfcap/studies/stress) on every scene is a process of its own with a limit of time: a crash or a
-hang is a result like any other. A run lies in OUT/SCENE/KEY, KEY standing for the condition and the program: a finished one
-is not run again, and a command that was stopped or ran out of its minutes goes on where it was. Scenes are made on the way.
-Writes OUT/stability.csv, and table, bounds and heat map between the marks of the page, the picture beside it.
+hang is a result like any other. --jobs of them run at a time and share the threads: a good part of a run has only one. A
+run lies in OUT/SCENE/KEY, KEY standing for the condition and the program: a finished one is not run again, and a command
+that was stopped or ran out of its minutes goes on where it was. Scenes are made on the way. Writes OUT/stability.csv, and
+table, bounds and heat map between the marks of the page, the picture beside it.
 
 Exit 0: nothing crashed, hung or ended in silence without a surface. 1: something did. 2: bad input. 130: interrupted.
 """
@@ -19,12 +21,15 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import psutil
+import torch
 import trimesh
 
 from torch_surfcap import report
@@ -45,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _options(arguments)
     try:
+        if options.jobs < 1:
+            raise InputError(f"--jobs: found {options.jobs}, expected a number from 1 on")
         chosen = _chosen(options)
         if options.trial:
             return _trial(options, chosen[1] if len(chosen) > 1 else CLEAN)
@@ -54,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for scene, condition in _rows(options, chosen)
         }
         report.write_history(options.out / "stability.csv", page.lines(results))
-        page.write(options.page, results, _command(options))
+        page.write(options.page, results, _command(options), options.jobs)
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
@@ -65,14 +72,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(conditions: Sequence[Condition], options: argparse.Namespace) -> bool:
     """Run what is not finished, as long as another run is likely to end in time; False when interrupted."""
     todo = [row for row in _rows(options, conditions) if not read_result(*row, options.out)]
-    for number, (scene, condition) in in_time(todo, 60 * options.minutes, "runs"):
-        print(f"[{number + 1}/{len(todo)}] {scene}, {condition.title}: ", end="", flush=True)
+    clean, spoilt = [row for row in todo if row[1] is CLEAN], [row for row in todo if row[1] is not CLEAN]
+    end = time.monotonic() + 60 * options.minutes
+    # The clean ones are done before any that is compared with them begins.
+    return all(_run_part(part, options, end - time.monotonic()) for part in (clean, spoilt))
+
+
+def _run_part(todo: Sequence[tuple[str, Condition]], options: argparse.Namespace, seconds: float) -> bool:
+    """Runs, `options.jobs` at a time; False when interrupted."""
+    began, lock, stopped = in_time(todo, seconds, "runs"), threading.Lock(), threading.Event()
+
+    def work() -> None:
+        while True:
+            with lock:
+                number, row = next(began, (-1, None))
+            if row is None:
+                return
+            result = run_one(*row, options, stopped)
+            words = page.in_words(result)
+            print(f"[{number + 1}/{len(todo)}] {row[0]}, {row[1].title}: {words}", flush=True)
+
+    with ThreadPoolExecutor(options.jobs) as pool:
+        workers = [pool.submit(work) for _ in range(options.jobs)]
         try:
-            result = run_one(scene, condition, options)
+            for worker in workers:
+                worker.result()
         except KeyboardInterrupt:
+            stopped.set()
             print("interrupted")
             return False
-        print(page.in_words(result), flush=True)
     return True
 
 
@@ -81,18 +109,21 @@ def _rows(options: argparse.Namespace, conditions: Sequence[Condition]) -> list[
     return [(s, c) for s in options.scenes for c in conditions if not c.scenes or s in c.scenes]
 
 
-def run_one(scene: str, condition: Condition, options: argparse.Namespace) -> dict[str, Any]:
-    """One run in a process of its own; what its folder says of it from now on."""
+def run_one(
+    scene: str, condition: Condition, options: argparse.Namespace, stopped: threading.Event
+) -> dict[str, Any]:
+    """One run in a process of its own; what its folder says of it from now on. Raises KeyboardInterrupt once stopped."""
     folder = _folder(scene, condition, options.out)
     shutil.rmtree(folder, ignore_errors=True)  # what an interrupted run has left
     folder.mkdir(parents=True)
     command = [sys.executable, str(Path(__file__).resolve()), f"--out={options.out}", f"--scenes={scene}"]
     command += [f"--trial={condition.group}/{condition.title}", f"--folder={folder}"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    threads = max(1, torch.get_num_threads() // options.jobs)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": str(threads)}
     with (folder / "log.txt").open("w", encoding="utf-8") as log:
         child = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
         try:
-            status = _wait(child, options.limit)
+            status = _wait(child, options.limit, stopped)
         finally:
             if child.poll() is None:
                 os.killpg(child.pid, signal.SIGKILL)
@@ -110,10 +141,12 @@ def run_one(scene: str, condition: Condition, options: argparse.Namespace) -> di
     return result
 
 
-def _wait(child: subprocess.Popen[bytes], limit: float) -> int | None:
+def _wait(child: subprocess.Popen[bytes], limit: float, stopped: threading.Event) -> int | None:
     """Exit status, None after `limit` seconds; those in which a process of ours was stopped from outside do not count."""
     spent, step = 0.0, min(0.5, limit)
     while spent < limit:
+        if stopped.is_set():
+            raise KeyboardInterrupt
         begin = time.monotonic()
         try:
             return child.wait(step)
@@ -196,6 +229,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--groups", type=names, default=[], metavar="NAME,...", help="all by default")
     parser.add_argument("--only", default="", metavar="TEXT", help="conditions with this in their title")
     parser.add_argument("--minutes", type=float, default=60.0, help="start no run that would end later")
+    parser.add_argument("--jobs", type=int, default=2, help="runs at a time")
     parser.add_argument("--limit", type=float, default=180.0, help="of one run, seconds: beyond it hangs")
     parser.add_argument("--page", type=Path, default=PAGE, metavar="MD", help="with marks for the tables")
     parser.add_argument("--trial", default="", help=argparse.SUPPRESS)  # one run, in this process

@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.fitting.sphere import ball
 from tests.fitting.stages import begun
 from torch_surfcap import Cameras, Capture, fit
-from torch_surfcap.fitting.alignment import Pinholes, Registration, aligned, moved, shifts
+from torch_surfcap.fitting.alignment import Pinholes, Registration, aligned, displacements, is_off, moved
 
 VIEWS, SIDE = 12, 64
 SMALL: dict[str, Any] = {"sh_degree": 0, "levels": 2, "voxel": 0.015}
@@ -84,11 +84,34 @@ def test_a_wrong_calibration_is_refined(plates: bool) -> None:
             there, here = (c.project(i, middle)[0][0] for c in (cameras, capture.cameras))
             motion[i, :2] = (there - here) / focal
         motion = motion - (registration.common @ (registration.inverse @ motion.flatten())).view_as(motion)
-        return float(shifts(capture.cameras, motion).median())
+        return float(displacements(capture.cameras, motion, stage.grid)[:, 0].median())
 
     before, after = off(wrong), off(found)
     assert before > 0.8
     assert after < 0.15 * before
+
+
+@pytest.mark.parametrize("kind", range(3))
+def test_displacements_are_those_of_what_is_seen(kind: int) -> None:
+    """Of the middle by a shift, of what is beside it by zoom and roll; each kind alone tells a wrong calibration."""
+    stage, _, _ = begun(ball(VIEWS, 32), 0.06, 30)
+    given, motion = stage.rays.cameras, torch.zeros(VIEWS, 4, dtype=torch.float64)
+    motion[:, (0, 2, 3)[kind]] = 0.001
+    after, grid = moved(given, motion), stage.grid
+    half = 2 * grid.voxel_size * torch.tensor(grid.size, dtype=torch.float64)
+    middle = torch.tensor(grid.origin, dtype=torch.float64) + half
+    expected = []
+    for i in range(VIEWS):
+        beside = given.world_to_camera[i, 0, :3] * (half.max() / 2 if kind else 0.0)
+        points = torch.stack([middle, middle + beside])
+        there, here = (c.project(i, points)[0] for c in (after, given))
+        moved_by = there - here
+        expected.append((moved_by[1] - moved_by[0] if kind else moved_by[0]).norm())
+    found = displacements(given, motion, grid)
+    torch.testing.assert_close(found[:, kind], torch.stack(expected), rtol=0.02, atol=0.0)
+    assert float(found.sum()) == pytest.approx(float(found[:, kind].sum()))
+    assert is_off(found / found[:, kind].median() * 0.21)
+    assert not is_off(found / found[:, kind].median() * 0.14)
 
 
 def test_a_right_calibration_stays() -> None:

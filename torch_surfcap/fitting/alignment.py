@@ -31,7 +31,9 @@ ROBUST = 0.1  # difference of colours above which it counts linearly
 # What is known beforehand: shift (pixels of the level), zoom and roll are 0 to within these, a colour to within NOISE.
 DEVIATION, NOISE = (1.0, 1.0, 0.01, 0.01), 0.05
 FARTHEST = 0.05  # of a picture's size: a camera that seems shifted further is wrong altogether, and stays where it is
-OFF = 0.2  # median shift, pixels of the level, from which on a calibration is off: less, wrong geometry may cause
+# The median shift, zoom and roll, in pixels of the level that they move the subject by, from which on a calibration is off:
+# less, wrong geometry may cause.
+OFF = (0.2, 0.15, 0.15)
 
 
 @dataclass(frozen=True)
@@ -140,9 +142,19 @@ class Registration:
         return total - (self.common @ (self.inverse @ total.flatten())).view_as(total)
 
 
-def shifts(given: Cameras, motion: Tensor) -> Tensor:
-    """[N] length of the motions' shifts, in pixels of these cameras' pictures."""
-    return (motion[:, :2].cpu() * given.K[:, [0, 1], [0, 1]]).norm(dim=1)
+def displacements(given: Cameras, motion: Tensor, grid: TileGrid) -> Tensor:
+    """[N, 3] how far shift, zoom and roll of motions [N, 4] move what is seen of the scene, in pixels of these cameras'
+    pictures: the latter two what is seen beside the scene's middle."""
+    motion, focal = motion.cpu(), given.K[:, [0, 1], [0, 1]]
+    seen, radius = _extent(given, grid)
+    beside = focal.mean(1) * radius / seen[:, 2].clamp(min=1e-6)
+    shift = (motion[:, :2] * focal).norm(dim=1)
+    return torch.cat([shift[:, None], motion[:, 2:].abs() * beside[:, None]], 1)
+
+
+def is_off(moved_by: Tensor) -> bool:
+    """Whether displacements [N, 3], in pixels of the level, are those of cameras whose calibration is off."""
+    return bool((moved_by.median(dim=0).values > moved_by.new_tensor(OFF)).any())
 
 
 def moved(cameras: Cameras, motion: Tensor) -> Cameras:
@@ -190,10 +202,7 @@ def _similarities(cameras: Cameras, grid: TileGrid) -> tuple[Tensor, Tensor]:
     """Motions [4 N, 7] by which pictures follow a shift, turn and growth of the scene about its middle, and the operator
     [7, 4 N] that finds those nearest to given motions, as lengths at the middle of the scene."""
     R = cameras.world_to_camera[:, :3, :3]
-    half = torch.tensor(grid.size, dtype=torch.float64) * (4 * grid.voxel_size / 2)
-    middle = torch.tensor(grid.origin, dtype=torch.float64) + half
-    radius = float(half.max()) / 2  # where, on average, there is something to turn and to grow
-    seen = R @ middle + cameras.world_to_camera[:, :3, 3]
+    seen, radius = _extent(cameras, grid)
     depth = seen[:, 2].clamp(min=1e-6)
     x, y = (seen[:, :2] / depth[:, None]).unbind(1)
     effect = torch.zeros(len(R), 4, 7, dtype=torch.float64)  # lengths
@@ -208,3 +217,12 @@ def _similarities(cameras: Cameras, grid: TileGrid) -> tuple[Tensor, Tensor]:
     common = torch.linalg.solve(lengths, effect).flatten(0, 1)
     nearest = torch.linalg.pinv(effect.flatten(0, 1)).view(7, len(R), 4)
     return common, torch.einsum("knj,nji->kni", nearest, lengths).flatten(1)
+
+
+def _extent(cameras: Cameras, grid: TileGrid) -> tuple[Tensor, float]:
+    """Where the cameras see the middle of the scene, [N, 3], and how far from it, on average, there is something to turn
+    and to grow."""
+    half = torch.tensor(grid.size, dtype=torch.float64) * (4 * grid.voxel_size / 2)
+    middle = torch.tensor(grid.origin, dtype=torch.float64) + half
+    pose = cameras.world_to_camera
+    return pose[:, :3, :3] @ middle + pose[:, :3, 3], float(half.max()) / 2

@@ -164,12 +164,12 @@ class Course:
         they were."""
         studio, so_far = self.studio, self.so_far
         if stage.number == min(1, len(self.plan) - 2) and studio.refines:
-            shift = alignment.shifts(studio.given[0], studio.motion)
+            moved_by = alignment.displacements(studio.given[0], studio.motion, stage.grid)
             known = [i for i, name in enumerate(self.capture.names) if name not in so_far.left_out]
+            shift = moved_by.norm(dim=1)
             usual = float(shift[known].median())
             so_far.shift = {self.capture.names[i]: float(shift[i]) for i in known}
-            off = usual > alignment.OFF * 2**stage.level.halvings
-            if off:
+            if alignment.is_off(moved_by[known] / 2**stage.level.halvings):
                 so_far.warnings.append(
                     f"cameras: the photographs lie {usual:.2f} pixels beside what the others show (the median camera), "
                     "the calibration is refined"

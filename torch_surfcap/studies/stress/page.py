@@ -188,8 +188,9 @@ def write_heat_map(path: Path, results: Results) -> None:
         figure.savefig(partial)
 
 
-def write(path: Path, results: Results, command: str) -> None:
-    """Put everything between the marks of a page, which is made where there is none, and the picture beside it."""
+def write(path: Path, results: Results, command: str, jobs: int = 1) -> None:
+    """Put everything between the marks of a page, which is made where there is none, and the picture beside it. jobs: runs
+    at a time."""
     text = path.read_text(encoding="utf-8") if path.is_file() else f"# Stability\n\n{MARKS[0]}\n{MARKS[1]}\n"
     if text.count(MARKS[0]) != 1 or text.count(MARKS[1]) != 1:
         raise InputError(f"{path}: expected the marks {MARKS[0]} and {MARKS[1]}, once each")
@@ -202,7 +203,7 @@ def write(path: Path, results: Results, command: str) -> None:
         f"- *{c.title}*: {c.sentence}" for c in dict.fromkeys(condition for _, condition in results)
     )
     parts = [
-        f"Written by\n\n    {command}\n\nwith {program()} on {machine()}. {count}",
+        f"Written by\n\n    {command}\n\nwith {program()} on {machine()}, {jobs} runs at a time. {count}",
         f"![heat map]({picture.name})",
     ]
     parts += ["## Bounds", bounds_table(results), "## Every run", table(results), "## Conditions", sentences]
