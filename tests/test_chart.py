@@ -247,7 +247,7 @@ def test_a_tiny_chart(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     arguments = [f"--out={tmp_path / 'out'}", f"--scene={scene}", f"--sweep={sweep}", f"--page={page}"]
     arguments += ["--presets=standard", "levels=1", "floor=off", "device=cpu"]
     assert command.main([*arguments, "--minutes=0"]) == 0
-    assert "0 rows are done, 0\nfailed, 3 are still to be run" in page.read_text(encoding="utf-8")
+    assert "0 rows are\ndone, 0 failed, 3 are still to be run" in page.read_text(encoding="utf-8")
     assert command.main(arguments) == 0
     with (tmp_path / "out" / "chart.csv").open(encoding="utf-8") as file:
         lines = {line["name"]: line for line in csv.DictReader(file)}
@@ -259,6 +259,7 @@ def test_a_tiny_chart(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert lines["soft hull alone"]["psnr_masked"] == ""
     assert float(lines["half"]["edge"]) == 32
     assert float(lines["standard"]["level 1: march"]) > 0
+    assert {name.partition(": ")[2] for name in lines["standard"] if ": " in name} <= {*chart.WORK}
     text = page.read_text(encoding="utf-8")
     assert "python train/chart.py --scene figure=DATA/figure" in text
     assert str(tmp_path) not in text

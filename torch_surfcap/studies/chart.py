@@ -22,6 +22,7 @@ PRESETS, RIVALS = "Presets", "Rivals"  # titles of groups that are no sweep
 WORK = {
     "start": "start",
     "load": "load",
+    "reject": "silhouettes compared",
     "box": "box",
     "floor": "floor",
     "hull": "hull",
@@ -34,6 +35,8 @@ WORK = {
     "voxels": "voxel terms",
     "adam": "Adam",
     "gains": "gains",
+    "align": "registration",
+    "judge": "cameras judged",
     "rest": "rest of the fit",
     "mesh": "extraction",
     "score": "scores",
@@ -112,7 +115,7 @@ def breakdown(seconds: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     if levels:
         known = sum(sum(level.values()) for level in levels)
         levels[-1]["rest"] = max(0.0, seconds.get("fit", known) - known)
-    places = {"before": ("start", "load", "box", "floor", "hull"), "after": ("mesh", "score", "write")}
+    places = {"before": ("start", "load", "reject", "box", "floor", "hull"), "after": ("mesh", "score", "write")}
     outer = {
         place: {name: float(seconds[name]) for name in names if name in seconds}
         for place, names in places.items()
