@@ -115,7 +115,10 @@ def breakdown(seconds: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     if levels:
         known = sum(sum(level.values()) for level in levels)
         levels[-1]["rest"] = max(0.0, seconds.get("fit", known) - known)
-    places = {"before": ("start", "load", "reject", "box", "floor", "hull"), "after": ("mesh", "score", "write")}
+    places = {
+        "before": ("start", "load", "reject", "box", "floor", "hull"),
+        "after": ("mesh", "score", "write"),
+    }
     outer = {
         place: {name: float(seconds[name]) for name in names if name in seconds}
         for place, names in places.items()
