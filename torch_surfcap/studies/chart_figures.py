@@ -223,7 +223,7 @@ def _bars(axes: Any, mark: Mark) -> set[str]:
 def _bar(kind: str) -> dict[str, Any]:
     """How a kind of work looks."""
     number = list(WORK).index(kind)
-    hatch = "///" if number >= 10 else None  # there are ten colours
+    hatch = (None, "///", "...")[number // 10]  # there are ten colours
     return {"facecolor": f"C{number % 10}", "edgecolor": "white", "hatch": hatch}
 
 
