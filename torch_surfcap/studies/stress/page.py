@@ -24,6 +24,7 @@ BROKEN = ("crashed", "hung", "not finite", "empty")
 SAME = {"rotated": 0.3, "far away": 0.03}  # voxels that the mesh may move by on average, 0.1 unless named
 SCORES = ("chamfer", "concave", "pieces", "psnr", "seconds", "memory", "moved_voxels")
 WORST = 4.0  # times the clean run's, at which the heat map's colours end
+DARK = 3.0  # the same, where black does not show on them
 
 # Group and title of a condition, and how many times the clean run's Chamfer and concave part it may reach.
 BOUNDS = (
@@ -177,13 +178,16 @@ def write_heat_map(path: Path, results: Results) -> None:
                 result, times = results.get((scene, condition), {}), shown[row, column]
                 word = f"{times:.2f}" if not math.isnan(times) else result.get("outcome", "")
                 spoken = "*" if result.get("said") or result.get("found") else ""
-                axes.text(column, row, word + spoken, ha="center", va="center", fontsize=6)
+                dark = max(times, 1 / times) > DARK
+                color = "white" if dark else "black"
+                axes.text(column, row, word + spoken, ha="center", va="center", fontsize=6, color=color)
         axes.set_xticks(range(len(columns)), [f"{s}\n{n}" for s, n in columns], fontsize=7)
         axes.set_yticks(range(len(shown)), [c.title for c in conditions[part]], fontsize=6)
         axes.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
-    figure.colorbar(
-        image, ax=figure.axes, label="times the clean run's; *: the program said something", shrink=0.4
-    )
+    bar = figure.colorbar(image, ax=figure.axes, shrink=0.4, extend="both")
+    bar.set_label("times the clean run's; *: the program said something")
+    bar.ax.minorticks_off()
+    bar.set_ticks([1 / WORST, 0.5, 1, 2, WORST], labels=[f"{1 / WORST:g}", "0.5", "1", "2", f"{WORST:g}"])
     with atomic_write(path) as partial:
         figure.savefig(partial)
 
